@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Reason
+from selfcal_ros.collection.marks import identify
 from selfcal_ros.collection.marks.identify import (
     IdentityRules,
     identify_angular,
     identify_grid,
     wrap,
 )
-from selfcal_ros.collection.marks.rigid import Rigid, fit_motion
+from selfcal_ros.collection.marks.rigid import MotionEstimate, Rigid, RigidFit, fit_motion
 from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -189,3 +190,14 @@ def test_wrapped_angles_lie_within_half_a_turn_and_inner_ones_keep_their_bits():
     np.testing.assert_array_equal(wrap(inner), inner)
     np.testing.assert_allclose(wrap(inner + 6 * pi), inner, atol=1e-14)
     assert wrap(np.array([pi]))[0] == pi
+
+
+def test_estimate_and_fit_are_folded_by_the_same_whole_pitches():
+    known = MotionEstimate(Rigid(1e-3, 0.0123, -0.0288), (0.0, 0.0), 1e-4, 1e-4)
+    fit = RigidFit(Rigid(1.2e-3, 0.0124, -0.0287), (0.0, 0.0), 9, 1e-3, 1e-12)
+    straight = View("v").on_stage(Artifact(5, 0.01))
+    folded, moved = identify._folded(straight, known, fit, 0.01)
+    for found, wanted in ((folded.rigid, (1e-3, 0.0023, 0.0012)),
+                          (moved.rigid, (1.2e-3, 0.0024, 0.0013))):
+        assert (found.phi_rad, found.tx_m, found.ty_m) == pytest.approx(wanted, abs=1e-12)
+    assert (folded.offset_error_m, moved.marks) == (1e-4, 9)

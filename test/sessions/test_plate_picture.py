@@ -32,6 +32,15 @@ def test_what_lies_behind_the_last_missing_mark_that_is_named_is_not_told():
                      ".oooo??"]
 
 
+def test_what_is_not_told_begins_behind_the_last_of_three_named_marks():
+    lines, _ = plate_picture(PLATE, View("v"), [(2, 1), (-3, -2), (0, 0)], 9, 20)
+    assert lines == ["ooooo??",
+                     "ooooo.?",
+                     "ooo.oo?",
+                     "oooooo?",
+                     ".ooooo?"]
+
+
 def test_nothing_is_drawn_where_nothing_is_told():
     assert plate_picture(PLATE, View("v"), [], 3, 20) == ([], 1)
     assert plate_picture(PLATE, View("v", 0.0, (0.07, 0.0)), [], 0, 20) == ([], 1)

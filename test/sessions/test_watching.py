@@ -2,6 +2,7 @@
 """What the monitor makes of the topics of a cell."""
 
 import json
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -63,6 +64,8 @@ def test_the_plate_is_drawn_in_its_own_frame_top_line_first(watch):
                                                                  {"duplicate": 2})
     assert view["repeatability_um"] == pytest.approx(0.02)
     assert view["repeatability_arcsec"] is None
+    watch.take_status(status(0, [], sigma_theta=math.radians(2 / 3600)))
+    assert watch.picture()["view"]["repeatability_arcsec"] == pytest.approx(2.0)
 
 
 def test_marks_outside_of_the_field_are_blank(watch):

@@ -8,7 +8,7 @@ import numpy as np
 
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.problem import Problem, sigma_of
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.visits import squares_within
 
 FAR = 0.02
@@ -49,7 +49,7 @@ class Moving:
         self.change = float(np.abs(self.moved - before).max())
         return self.places.changes(self.moved, self.problem.turn_rad)
 
-    def ground(self, found: JointFit) -> Ground:
+    def ground(self, found: JointFit) -> TermInputs:
         """Return the ground with visits less what the stage error differs by between them."""
         ground = self.problem.ground
         if self.places is None or self.moved is None:

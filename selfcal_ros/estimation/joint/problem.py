@@ -17,7 +17,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import between_visits
 from selfcal_ros.model.readings import Measurements
@@ -87,7 +87,7 @@ class Problem:
     half_width_m: float
     conditions: Conditions
     direct: bool
-    ground: Ground
+    ground: TermInputs
     reference: ReferenceLength | None = None
     rigid: bool = True
     terms: tuple[ModelTerm, ...] = ()

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.ground import Ground, ground_of
+from selfcal_ros.estimation.terms.ground import TermInputs, ground_of
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
 from selfcal_ros.estimation.terms.shapes import shapes_in_full
@@ -105,7 +105,8 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     return HeldReadings(grid, out, rows, np.concatenate(own), moved)
 
 
-def _in_time_of(ground: Ground, grid: GridData, kept: Measurements, held: Measurements) -> Ground:
+def _in_time_of(ground: TermInputs, grid: GridData, kept: Measurements,
+                held: Measurements) -> TermInputs:
     """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
     for index, view in zip(grid.index, ground.visits, strict=True):

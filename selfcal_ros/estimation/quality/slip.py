@@ -23,7 +23,7 @@ from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.causes import cause_of
 from selfcal_ros.estimation.verdict.explanations import PlacedSlip, find_explanations
@@ -256,12 +256,12 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     return cause_of(found[0], ground)
 
 
-def slip_at_line(ground: Ground, row: int, slip: Slip, phase: complex) -> TermColumns:
+def slip_at_line(ground: TermInputs, row: int, slip: Slip, phase: complex) -> TermColumns:
     """Return the columns of a slip before a line of marks: offset along x and y, rotation.
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         Inputs of the columns.
     row : int
         The grid view.

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
 from selfcal_ros.estimation.terms.visits import ViewVisits, squares_within
 from selfcal_ros.model.terms import OF_LINES, UNITS, VISIT_TERMS, ModelTerm, TermName
 
-Seen = list[list[np.ndarray | None]]
+AtVisits = list[list[np.ndarray | None]]
 
 AXES: tuple[tuple[str, complex], ...] = (("x", 1), ("y", 1j))
 """Along x and along y: what a column multiplies its shape by."""
@@ -91,7 +91,7 @@ class TermColumns:
     columns: tuple[Column, ...]
     shapes: Shapes
     within: WithinMarks
-    at: Seen
+    at: AtVisits
     lines: LineColumns = NO_LINES
 
     @property
@@ -100,7 +100,7 @@ class TermColumns:
         return self.shapes.grid
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> AtVisits:
         """Values of each column at the visits of each view, as `at` has them of the shapes."""
         return [[None if one is None else unit * one for one in self.at[shape]]
                 for shape, unit in zip(self.shapes.of_column, self.shapes.unit, strict=True)]
@@ -135,14 +135,14 @@ class TermColumns:
 
 
 @dataclass
-class Made:
-    """Columns in the making: their shapes at the marks (marks,) by view, and at the visits."""
+class ColumnBuilder:
+    """Columns under construction: their shapes at the marks (marks,) by view, and at the visits."""
 
     columns: list[Column] = field(default_factory=list)
     of_column: list[int] = field(default_factory=list)
     unit: list[complex] = field(default_factory=list)
     means: list[dict[int, np.ndarray]] = field(default_factory=list)
-    at: Seen = field(default_factory=list)
+    at: AtVisits = field(default_factory=list)
     lines: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
     def add(self, means: dict[int, np.ndarray], at: list[np.ndarray | None]) -> int:
@@ -157,7 +157,7 @@ class Made:
         self.of_column.append(shape)
         self.unit.append(unit)
 
-    def done(self, ground: Ground) -> TermColumns:
+    def done(self, ground: TermInputs) -> TermColumns:
         """Return the columns."""
         shapes = shapes_of(self.means, self.of_column, self.unit, ground.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
@@ -165,12 +165,12 @@ class Made:
                            LineColumns(np.array(at), np.stack(values)) if at else NO_LINES)
 
 
-def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
+def term_columns(ground: TermInputs, terms: Iterable[ModelTerm], degree: int) -> TermColumns:
     """Return the columns of `terms`.
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         Plate, views, visits.
     terms : iterable of ModelTerm
         What is wanted.
@@ -182,7 +182,7 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    made = Made()
+    made = ColumnBuilder()
     for term in terms:
         if term.name in VISIT_TERMS:
             _require_visits(ground, term.name)
@@ -197,13 +197,13 @@ def term_columns(ground: Ground, terms: Iterable[ModelTerm], degree: int) -> Ter
     return made.done(ground)
 
 
-def made_anew(ground: Ground, term: ModelTerm | None, before: TermColumns, *,
+def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *,
               moved: bool = False) -> TermColumns:
     """Return columns of which those of one shared term of the visits are of another ground.
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         With other offsets or signs of approach.
     term : ModelTerm, optional
         One that all views share: its columns are made anew.
@@ -212,7 +212,7 @@ def made_anew(ground: Ground, term: ModelTerm | None, before: TermColumns, *,
     moved : bool
         Whether visits differ from the means of their marks otherwise than before.
     """
-    fresh, at = Made(), list(before.at)
+    fresh, at = ColumnBuilder(), list(before.at)
     own: dict[int, int] = {}
     if term is not None:
         _shared_columns(fresh, ground, term)
@@ -229,13 +229,13 @@ def made_anew(ground: Ground, term: ModelTerm | None, before: TermColumns, *,
     return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
-def columns_from(ground: Ground, columns: Iterable[Column],
+def columns_from(ground: TermInputs, columns: Iterable[Column],
                  shapes: Iterable[tuple[np.ndarray, Sequence[complex]]]) -> TermColumns:
     """Return columns of one view each.
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         Plate, views, visits.
     columns : iterable of Column
         What each is.
@@ -243,7 +243,7 @@ def columns_from(ground: Ground, columns: Iterable[Column],
         Values at the visits of a view, (V,), plate frame, and the units, 1 or i, of the columns
         that are made of them: as many columns in a row, of one view.
     """
-    made, rest = Made(), iter(columns)
+    made, rest = ColumnBuilder(), iter(columns)
     for values, units in shapes:
         mine = [next(rest) for _ in units]
         [view] = {column.view for column in mine}
@@ -258,7 +258,7 @@ def columns_from(ground: Ground, columns: Iterable[Column],
     return made.done(ground)
 
 
-def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColumns:
+def joined(ground: TermInputs, first: TermColumns, second: TermColumns) -> TermColumns:
     """Return the columns of both."""
     at = [*first.at, *second.at]
     shapes = first.shapes.with_others(second.shapes)
@@ -266,7 +266,7 @@ def joined(ground: Ground, first: TermColumns, second: TermColumns) -> TermColum
                        first.lines)
 
 
-def _require_visits(ground: Ground, name: TermName) -> None:
+def _require_visits(ground: TermInputs, name: TermName) -> None:
     for view, visits in zip(ground.names, ground.visits, strict=True):
         if visits is None:
             raise InputError(f"view '{view}'", f"the term '{name}' needs to know when, with which "
@@ -274,7 +274,7 @@ def _require_visits(ground: Ground, name: TermName) -> None:
                              "tell it", "solve from the bag, or leave the term out")
 
 
-def _drift_columns(made: Made, ground: Ground, term: ModelTerm, degree: int) -> None:
+def _drift_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm, degree: int) -> None:
     orders = np.arange(1, degree + 1)
     for view, visits in enumerate(ground.visits):
         if visits is None:
@@ -289,7 +289,7 @@ def _drift_columns(made: Made, ground: Ground, term: ModelTerm, degree: int) -> 
                 made.column(Column(term.name, view, f"{axis} P{order}", term.size), number, unit)
 
 
-def _shared_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+def _shared_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
     """Add the columns of a term of the visits whose coefficients all views share."""
     both = [None if visits is None else _values(ground, term.name, visits) * visits.phase
             for visits in ground.visits]
@@ -310,14 +310,14 @@ _SHARED: dict[str, tuple[tuple[tuple[str, complex], ...], ...]] = {
 """Columns of each shape of a shared term: a name and the unit that multiplies the shape."""
 
 
-def _values(ground: Ground, name: TermName, visits: ViewVisits) -> np.ndarray:
+def _values(ground: TermInputs, name: TermName, visits: ViewVisits) -> np.ndarray:
     """Return the two shapes of a shared term at the visits, stage frame, (2, V)."""
     if name is TermName.MICROSCOPE:  # a reading has o where it should have (1 + E) o
         return -np.stack([visits.offset, visits.offset.conj()])
     return ground.indicated * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
 
 
-def _plate_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+def _plate_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
     """Add the columns of plate scale or shape: the same at all visits of a mark.
 
     A size says how far views scatter about what they have in common, so that each view has its
@@ -341,7 +341,7 @@ _PLATE: dict[str, tuple[tuple[str, int, complex], ...]] = {
 """Columns of each term of the plate: name, number of the form, and the unit that multiplies it."""
 
 
-def _plate_forms(ground: Ground, name: TermName) -> np.ndarray:
+def _plate_forms(ground: TermInputs, name: TermName) -> np.ndarray:
     """Return the forms of a term of the plate at the marks, (k, marks)."""
     z = ground.z.reshape(-1)
     if name is TermName.PLATE_SHAPE:
@@ -352,7 +352,7 @@ def _plate_forms(ground: Ground, name: TermName) -> np.ndarray:
     return forms[:1] if name is TermName.PLATE_SCALE else forms
 
 
-def _line_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
+def _line_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
     """Add the columns of a term of the lines, which no grid reading has."""
     count = len(ground.line_names)
     angle = 2 * np.pi / max(ground.n_lines, 1) * np.arange(ground.n_lines)
@@ -368,7 +368,7 @@ def _line_columns(made: Made, ground: Ground, term: ModelTerm) -> None:
             made.column(Column(term.name, view, component, term.size), made.add({}, nothing), 1)
 
 
-def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
+def _within(ground: TermInputs, at: AtVisits, shapes: Shapes) -> WithinMarks:
     n = len(shapes.unit)
     dof = sum(2 * (len(visits.mark) - len(np.unique(visits.mark)))
               for visits in ground.visits if visits is not None and visits.repeated)
@@ -376,7 +376,7 @@ def _within(ground: Ground, at: Seen, shapes: Shapes) -> WithinMarks:
     return _within_anew(ground, at, shapes, before=nothing, changed=np.arange(shapes.n))
 
 
-def _within_anew(ground: Ground, at: Seen, shapes: Shapes, *, before: WithinMarks,
+def _within_anew(ground: TermInputs, at: AtVisits, shapes: Shapes, *, before: WithinMarks,
                  changed: np.ndarray) -> WithinMarks:
     """Return what the means hide, the products of the shapes `changed` set up anew."""
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)

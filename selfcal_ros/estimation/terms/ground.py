@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the columns of terms stand on: plate, views and visits of a measurement."""
+"""Inputs of the term columns: plate, views and visits of a measurement."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ from selfcal_ros.model.terms import OF_LINES
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
-    """What the columns stand on.
+class TermInputs:
+    """Inputs of the term columns.
 
     Attributes
     ----------
@@ -56,19 +56,19 @@ class Ground:
         return (*names, "")[view]
 
 
-def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> Ground:
+def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> TermInputs:
     """Return the ground of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = maps_of(grid.y.shape[1:], grid.poses).z
     names = tuple(measurements.views[i].view.name for i in grid.index)
-    return Ground(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
+    return TermInputs(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
                   approach_sign(measurements.sense), tuple(view.view.name for view in lines),
                   measurements.artifact.angular_count, shared if len(shared) > 1 else ())
 
 
-def without_noise(ground: Ground, residuals: np.ndarray,
-                  of_terms: Sequence[np.ndarray | float] = ()) -> Ground:
+def without_noise(ground: TermInputs, residuals: np.ndarray,
+                  of_terms: Sequence[np.ndarray | float] = ()) -> TermInputs:
     """Return the ground with offsets from which the noise of the readings is taken off.
 
     The offset that a microscope saw holds the noise of its reading. As a column it would explain
@@ -77,7 +77,7 @@ def without_noise(ground: Ground, residuals: np.ndarray,
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         With the offsets as they were seen.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.

@@ -15,7 +15,7 @@ import numpy as np
 from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
 from selfcal_ros.estimation.lattice.maps import AnyViews, LatticeViews, maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import rms
 
@@ -182,7 +182,7 @@ def _along_both(field: np.ndarray, known: np.ndarray) -> np.ndarray:
     return field
 
 
-def places_of(measurements: Measurements, grid: GridData, ground: Ground,
+def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
               known: np.ndarray) -> StagePlaces | None:
     """Return where the stage stood; None where it stood at the sites, or no visit tells.
 
@@ -190,7 +190,7 @@ def places_of(measurements: Measurements, grid: GridData, ground: Ground,
     ----------
     measurements : Measurements
         The readings.
-    grid, ground : GridData, Ground
+    grid, ground : GridData, TermInputs
         What is made of them.
     known : bool array (nx, ny)
         Sites whose error is known.

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.columns import (
     term_columns,
 )
 from selfcal_ros.estimation.terms.equations import TermEquations
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
     project,
@@ -80,7 +80,7 @@ class Assumed:
 
 
 def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEquations,
-                   assumed: Assumed) -> Ground:
+                   assumed: Assumed) -> TermInputs:
     """Return the inputs for the planned views.
 
     Parameters
@@ -104,7 +104,7 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                    for row, view in zip(placed, grid_views, strict=True))
     lines = [views[i] for i in system.angular_index]
     shared = tuple(row for row, view in enumerate(lines) if view.grid)
-    return Ground(system.grid.views.z, artifact.grid_pitch_m * max(artifact.half),
+    return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.half),
                   system.grid.weight, visits, tuple(view.name for view in grid_views),
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
                   with_lines=shared if len(shared) > 1 else ())
@@ -147,7 +147,7 @@ def _view_time(found: VisitSequence) -> np.ndarray:
     return 2 * (found.time - found.time[0]) / (found.time[-1] - found.time[0]) - 1
 
 
-def planned_equations(system: NormalEquations, ground: Ground, terms: Iterable[ModelTerm],
+def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterable[ModelTerm],
                       assumed: Assumed) -> TermEquations:
     """Return the equations of terms with the readings of a plan.
 

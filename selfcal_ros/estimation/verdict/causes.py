@@ -14,7 +14,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.normal.equations import angular_residuals
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.explanations import FLOOR_M, LEVEL, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
@@ -41,14 +41,14 @@ Sized = tuple[float, float, dict[str, Any]]
 """Value and u of the most significant component, and further fields of the cause."""
 
 
-def cause_of(found: Explanation, ground: Ground) -> Cause:
+def cause_of(found: Explanation, ground: TermInputs) -> Cause:
     """Return an explanation of the residuals, or a term of the model, as a cause.
 
     Parameters
     ----------
     found : Explanation
         The explanation.
-    ground : Ground
+    ground : TermInputs
         Of the fit: names of the views, unit of a slip's rotation.
     """
     names = ground.line_names if found.name in OF_LINES else ground.names

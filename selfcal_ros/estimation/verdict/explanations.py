@@ -20,7 +20,7 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
-from selfcal_ros.estimation.terms.ground import Ground, without_noise
+from selfcal_ros.estimation.terms.ground import TermInputs, without_noise
 from selfcal_ros.estimation.verdict.off_sites import (
     READING,
     SLIP,
@@ -309,7 +309,7 @@ def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
         yield from (Group(str(name), rows, places=len(parts)) for rows in parts if rows.any())
 
 
-def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: TermColumns,
+def _with(ground: TermInputs, before: tuple[TermColumns, list[Group]], columns: TermColumns,
           groups: list[Group]) -> tuple[TermColumns, list[Group]]:
     """Return columns and groups with further ones appended."""
     n_before, n_after = len(before[0].columns), len(columns.columns)
@@ -320,7 +320,7 @@ def _with(ground: Ground, before: tuple[TermColumns, list[Group]], columns: Term
           for g in groups)]
 
 
-def _with_readings(model: ModelFit, ground: Ground, columns: TermColumns,
+def _with_readings(model: ModelFit, ground: TermInputs, columns: TermColumns,
                    groups: list[Group]) -> tuple[TermColumns, list[Group]]:
     phases = model.problem.system.grid.views.phases.conj()
     single, suspects = reading_columns(ground, model.found.residuals, phases)

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.terms.columns import (
     WithinMarks,
     columns_from,
 )
-from selfcal_ros.estimation.terms.ground import Ground
+from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.error_map import ErrorMap
@@ -43,7 +43,7 @@ class Suspect(NamedTuple):
     rows: np.ndarray
 
 
-def reading_columns(ground: Ground, residuals: np.ndarray,
+def reading_columns(ground: TermInputs, residuals: np.ndarray,
                     phases: np.ndarray) -> tuple[TermColumns, list[Suspect]]:
     """Return the columns of the readings with the largest residuals, and these readings.
 
@@ -51,7 +51,7 @@ def reading_columns(ground: Ground, residuals: np.ndarray,
 
     Parameters
     ----------
-    ground : Ground
+    ground : TermInputs
         Inputs of the columns.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
@@ -84,7 +84,7 @@ PLACES = 12
 """Number of instants in each view at which a slip is tested."""
 
 
-def slip_columns(ground: Ground) -> tuple[TermColumns, dict[tuple[int, float], np.ndarray]]:
+def slip_columns(ground: TermInputs) -> tuple[TermColumns, dict[tuple[int, float], np.ndarray]]:
     """Return the columns of slips, and a mask of those of each view and instant.
 
     Three for each slip: offset along x and y (stage axes, m), and rotation (m at the half width).
