@@ -15,7 +15,7 @@ from selfcal_ros.collection.marks.identify import (
     identify_grid,
 )
 from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, MotionEstimate, Rigid, fit_motion
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.truth import angular_deviation, random_truth
@@ -138,10 +138,14 @@ def test_the_advice_is_one_line_with_the_count():
 
 
 def turned(degrees, *, named, size=101, pitch=0.001, kept=1.0, offset=(1e-4, -5e-5), seed=0,
-           rules=RULES, where=lambda m, n: m == m):
-    """Return marks of a turned plate of which few carry ids, and what they are taken for."""
+           rules=RULES, where=lambda m, n: m == m, placed_deg=0.0):
+    """Return marks of a turned plate of which few carry ids, and what they are taken for.
+
+    The plan asks for a turn by `placed_deg`, over a map that reaches beyond the plate.
+    """
     rng = np.random.default_rng(seed)
-    artifact = Artifact(size, pitch, 24)
+    artifact = Artifact(size, pitch, 24, map_grid=MapGrid(5, size * pitch) if placed_deg else None)
+    view = View("v", np.deg2rad(placed_deg), angular=False)
     marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
     has_id = np.zeros(marks.shape[1], dtype=bool)
     if named == "corner":
@@ -150,9 +154,10 @@ def turned(degrees, *, named, size=101, pitch=0.001, kept=1.0, offset=(1e-4, -5e
         has_id[rng.choice(marks.shape[1], named, replace=False)] = True
     there = ((rng.random(marks.shape[1]) < kept) & where(*marks)) | has_id
     marks, has_id = marks[:, there], has_id[there]
-    read = marks * pitch + Rigid(np.deg2rad(degrees), *offset).at(marks * pitch)
+    nominal = np.stack(view.on_stage(artifact).turned(*marks * pitch))
+    read = nominal + Rigid(np.deg2rad(degrees), *offset).at(nominal)
     read += rng.normal(0, 5e-7, read.shape)
-    return marks, identify_grid(artifact, View("v"), read, ids=np.where(has_id, marks, 0),
+    return marks, identify_grid(artifact, view, read, ids=np.where(has_id, marks, 0),
                                 has_id=has_id, rules=rules)
 
 
@@ -173,8 +178,10 @@ def test_anchors_reach_over_lost_marks(named):
     np.testing.assert_array_equal(found.index, marks)
 
 
-def test_marks_without_ids_at_one_side_of_a_turned_plate_tell_its_rotation_themselves():
-    marks, found = turned(0.7, named=0, where=lambda m, n: m < -40)
+@pytest.mark.parametrize("placed_deg", [0.0, 37.0, 90.0, 211.0])
+def test_marks_without_ids_at_one_side_of_a_turned_plate_tell_its_rotation_themselves(placed_deg):
+    """There they are by more than half a pitch beside their places."""
+    marks, found = turned(0.9, named=0, where=lambda m, n: m < -40, placed_deg=placed_deg)
     assert set(found.reasons) == {None}
     np.testing.assert_array_equal(found.index, marks)
 

@@ -407,6 +407,8 @@ def test_the_rows_of_a_placed_plate_are_visited_one_after_the_other():
     assert list(zip(visits.m, visits.n, strict=True)) == [
         (-1, 0), (0, 1), (0, 0), (0, -1), (1, 0)]
     np.testing.assert_allclose([visits.i[-1], visits.j[-1]], [1.0, 0.5])
+    turned = visit_sequence(PLACED, replace(ASKEW, rotation_rad=TURN + pi / 2), order="raster")
+    assert (np.diff(turned.m) >= 0).all()
 
 
 def test_of_a_plate_placed_askew_the_nearest_marks_are_found():
