@@ -306,6 +306,15 @@ def test_bad_arguments(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_the_best_plan_off_the_lattice_identifies_the_stage(tmp_path, capsys):
+    """Half a turn leaves nodes unknown, and what is known of the others looks small."""
+    best = tmp_path / "best.yaml"
+    assert main(["plan", "suggest", shipped("general"), "--views", "3", "-o", str(best)]) == 0
+    assert "180 deg" not in capsys.readouterr().out
+    assert main(["plan", "check", str(best)]) == 0
+    assert yaml.safe_load(best.read_text())["map"]["grid_size"] == 7
+
+
 def test_bad_plans_name_the_place(tmp_path, capsys):
     data = yaml.safe_load(Path(shipped("hu")).read_text())
     data["views"][1]["rotation_deg"] = 46

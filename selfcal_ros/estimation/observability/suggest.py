@@ -22,7 +22,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     unused_name,
 )
 from selfcal_ros.estimation.observability.prediction import Prediction, predict
-from selfcal_ros.estimation.observability.rank import deficiency
+from selfcal_ros.estimation.observability.rank import deficiency, full_observability
 from selfcal_ros.estimation.observability.resistance import with_part_of_terms
 from selfcal_ros.estimation.observability.unseen import equivalent_key
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
@@ -162,7 +162,11 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
     The XY uncertainty includes the contribution of the terms of `against`.
     """
     system = planned_system(plan.artifact, plan.views)
-    unseen = deficiency(system)
+    if plan.artifact.map_grid is None:
+        unseen = deficiency(system)
+    else:  # outermost nodes may stay unknown
+        seen = full_observability(system, plan.artifact, plan.views)
+        unseen = 0 if seen.identifiable else max(seen.deficiency, 1)
     if unseen:
         return Score(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
