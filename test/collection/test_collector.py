@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase, Reason
+from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
@@ -402,3 +404,12 @@ def test_progress_counts_marks_and_repeats():
     assert not progress[0].complete
     assert progress[0].coverage == pytest.approx(27 / 28)
     assert found.views[0].used == 56
+
+
+def test_the_encoder_was_heard_from_its_first_joint_to_its_last():
+    collector = Collector(CollectorSettings())
+    for stamp in range(100, 301, 50):
+        collector.add_encoder(EncoderSample(stamp, ("x", "y"), (0.0, 0.0)))
+    for stamp in range(40, 201, 40):
+        collector.add_encoder(EncoderSample(stamp, ("theta",), (0.0,)))
+    assert collector._facts().span_ns == (40, 300)
