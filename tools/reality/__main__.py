@@ -16,9 +16,9 @@ from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| effect | largest error, nm (median) | in U: XY (x, y), θ | "
+HEADER = ("| effect | runs | largest error, nm (median) | in U: XY (x, y), θ | "
           "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
-          "first cause |\n|---|---|---|---|---|---|---|---|---|---|")
+          "first cause |\n|---|---|---|---|---|---|---|---|---|---|---|")
 
 SHOWN = {
     "plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad",
@@ -42,8 +42,8 @@ def row(name: str, found: Summary) -> str:
         name = name.replace(plain_text, shown)
     grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
     seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
-    text = (f"| {name} | {found.error_m * NM_PER_M:.3g} | {100 * found.within:.1f} ± "
-            f"{200 * found.u_within:.1f} % ({100 * found.within_x:.1f}, "
+    text = (f"| {name} | {found.runs} | {found.error_m * NM_PER_M:.3g} | "
+            f"{100 * found.within:.1f} ± {200 * found.u_within:.1f} % ({100 * found.within_x:.1f}, "
             f"{100 * found.within_y:.1f} %), {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
             f"{found.z_theta:.2f} | {grades} | {found.wrong}{seeds} | {causes} |")
     return text.replace("nan ± nan % (nan, nan %)", "–").replace("nan %", "–").replace("nan", "–")
@@ -69,8 +69,7 @@ def main() -> int:
         return 0
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
-    lines, done = [f"{args.runs} runs per case, {25 * args.runs} of the clean population and "
-                   f"{5 * args.runs} of the others:", "", HEADER], []
+    lines, done = [HEADER], []
     print("\n".join(lines), flush=True)
     for index, courses in finished(jobs, check_workers(args.workers)):
         case = every[index]
