@@ -87,7 +87,8 @@ RESULT = {
     "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] = site m = i − h, n = j − h, null "
                  "where unknown; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
                  "scale_difference, datum_theta",
-    "artifact_map": "ax, ay (m), a_theta (rad) of the plate, as error_map",
+    "artifact_map": "ax, ay, u_ax, u_ay (m), a_theta, u_a_theta (rad) of the plate, as error_map; "
+                    "u_a_theta with the θ datum zero_mean, no u of the plate by Hu's law",
     "observability": "rank, unknowns, deficiency, identifiable, modes, advice; unchecked_sites, "
                      "unchecked_lines: number that depend on single readings, null if not counted",
     "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "

@@ -49,6 +49,8 @@ class ViewResult:
 class ArtifactMap:
     """Plate error A = true - nominal, plate frame: ax, ay (nx, ny) in m, a_theta (K,) in rad.
 
+    `u_ax`, `u_ay`, `u_a_theta` are their standard uncertainties, NaN where unknown or not
+    computed; empty in results that do not have them.
     `magnification` is the least-squares scale of A, with its standard uncertainty: that of the
     plate relative to the encoders, whose own scale the datum removes from the map.
     """
@@ -58,6 +60,9 @@ class ArtifactMap:
     a_theta: np.ndarray
     magnification: float = math.nan
     u_magnification: float = math.nan
+    u_ax: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    u_ay: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    u_a_theta: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -256,7 +261,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                       "nonorthogonality": plain(emap.nonorthogonality),
                       "scale_difference": plain(emap.scale_difference),
                       "datum_theta": str(emap.datum_theta)},
-        "artifact_map": {key: plain(getattr(amap, key)) for key in ("ax", "ay", "a_theta")},
+        "artifact_map": {key: plain(getattr(amap, key)) for key in _PLATE_ARRAYS},
         "observability": plain(result.observability),
         "noise": plain(result.noise),
         "rejected": dict(result.rejected),
@@ -269,6 +274,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
 
 
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
+_PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
@@ -310,10 +316,7 @@ def _parse(data: dict) -> CalibrationResult:
     seen = read(Observability, data["observability"])
     return CalibrationResult(
         read(str, data["plan_id"]), error_map,
-        ArtifactMap(_array(amap["ax"], artifact.shape, "ax"),
-                    _array(amap["ay"], artifact.shape, "ay"),
-                    _array(amap["a_theta"], (artifact.angular_count,), "a_theta"),
-                    read(float, raw.get("magnification")), read(float, raw.get("u_magnification"))),
+        _plate(amap, artifact, raw),
         tuple(map(_view, data["views"])), seen, read(Noise, data["noise"]),
         {key: read(int, value) for key, value in data["rejected"].items()},
         {key: read(str, value) for key, value in data["input"].items()},
@@ -328,6 +331,16 @@ def _parse(data: dict) -> CalibrationResult:
         json_form.findings_from_list(Finding, data.get("findings", [])),
         json_form.budget_from_list(data.get("budget", [])),
         artifact if artifact.map_grid else None)
+
+
+def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:
+    shapes = dict.fromkeys(("ax", "ay", "u_ax", "u_ay"), artifact.shape) | dict.fromkeys(
+        ("a_theta", "u_a_theta"), (artifact.angular_count,))
+    return ArtifactMap(
+        **{key: _array(amap[key], shape, key) for key, shape in shapes.items()
+           if key in ("ax", "ay", "a_theta") or amap.get(key)},
+        magnification=read(float, raw.get("magnification")),
+        u_magnification=read(float, raw.get("u_magnification")))
 
 
 def _view(v: dict) -> ViewResult:

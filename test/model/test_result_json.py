@@ -43,7 +43,7 @@ def through_json(result):
 def assert_same(a, b):
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(a.error_map, name), getattr(b.error_map, name))
-    for name in ("ax", "ay", "a_theta"):
+    for name in ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta"):
         np.testing.assert_array_equal(getattr(a.artifact_map, name), getattr(b.artifact_map, name))
     for name in ("plan_id", "observability", "rejected", "input", "warnings", "method", "sense",
                  "extra", "artifact"):

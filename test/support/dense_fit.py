@@ -224,7 +224,9 @@ class DenseFit:
         rest = self._root * (self._values - self._predicted(p))
         prior = np.zeros((sized.sum(), len(p)))
         prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
-        held = self._datum(np.unique(self.site)) / (EXACTLY * self.sigma[0])
+        held = np.concatenate([self._datum(np.unique(self.site)), np.roll(
+            self._datum(np.unique(self.mark))[:3], self.a.start - self.g.start, axis=1)])
+        held = held / (EXACTLY * self.sigma[0])
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
         known = np.concatenate([rest, -prior @ p, -held @ p])
         self.p = p + solve[:, :len(known)] @ known
@@ -292,6 +294,38 @@ class DenseFit:
         rows = np.zeros((4, len(self.p)))
         rows[:, np.concatenate([sites, self.n + sites])] = np.linalg.qr(modes)[0].T
         return rows
+
+    def plate(self, known, sites):
+        """Plate's map and its u, marks `known` without translation and rotation: (2, nx, ny)."""
+        marks, sites = np.flatnonzero(known), np.flatnonzero(sites)
+        modes = self._datum(marks)[:3, :2 * self.n]
+        pick = np.zeros((2 * self.n, len(self.p)))
+        pick[:, self.a] = np.eye(2 * self.n)
+        x, y = self.artifact.x_m.ravel(), self.artifact.y_m.ravel()
+        pick += np.outer(np.concatenate([x, y]), self._part(sites, self.g, 3))
+        here = np.concatenate([marks, self.n + marks])
+        pick[here] -= (modes.T @ (modes @ pick))[here]
+        return self._quantity(pick, (2, *self.artifact.shape))
+
+    def _part(self, nodes, where, mode):
+        """Row of a rotation (2) or scale (3) of a map over nodes."""
+        x, y = (part.ravel()[nodes] for part in (self.artifact.x_m, self.artifact.y_m))
+        one, zero = np.ones(len(nodes)), np.zeros(len(nodes))
+        modes = np.stack([np.concatenate(pair) for pair in (
+            (one, zero), (zero, one), (-y, x), (x, y))], axis=1)
+        row = np.zeros(len(self.p))
+        row[np.arange(len(row))[where][np.concatenate([nodes, self.n + nodes])]] = np.linalg.pinv(
+            modes)[mode]
+        return row
+
+    def plate_theta(self, lines, sites, marks):
+        """Plate's angular map and its u, (K,): stage's mean 0 over `lines`, no map turned."""
+        pick = np.zeros((self.K, len(self.p)))
+        pick[:, self.at] = np.eye(self.K)
+        pick[:, self.gt] += self.sign * np.asarray(lines) / np.sum(lines)
+        pick -= self._part(np.flatnonzero(sites), self.g, 2)
+        pick -= self._part(np.flatnonzero(marks), self.a, 2)
+        return self._quantity(pick, (self.K,))
 
     def theta(self, known, axes=False):
         """Angular map and its standard uncertainty over the lines `known`, (K,) each.

@@ -58,20 +58,35 @@ def scale_datum(system: NormalEquations, reference: ReferenceLength,
     half_width_m : float
         Unit of the system's positions, m.
     """
-    grid, n = system.grid, 3 * system.grid.n_views
     u = reference.u_relative * half_width_m
     if reference.kind is not ReferenceKind.ARTIFACT:
-        rows = _slope(grid.views.z_sites, system.known_sites, reference.kind)
-        basis = system.gauge.orthonormal
-        rows = rows - basis @ np.real(basis.conj().T @ rows)
-        return ScaleDatum(-rows, np.zeros(n), 0.0, u)
-    dual = Gauge(grid.views.z, system.known_marks, scale=True).dual(3)
-    rows = system.gauge.dual(3).ravel() - grid.views.scatter(grid.relative_weight * dual).ravel()
+        return ScaleDatum(-slope_in_datum(system, reference.kind),
+                          np.zeros(3 * system.grid.n_views), 0.0, u)
+    return scale_by_plate(system, Gauge(system.grid.views.z, system.known_marks,
+                                        scale=True).dual(3), u)
+
+
+def slope_in_datum(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
+    """Return the row of the slope along an axis of a map in its datum, complex (sites,)."""
+    basis = system.gauge.orthonormal
+    rows = _slope(system.grid.views.z_sites, system.known_sites, kind)
+    return rows - basis @ np.real(basis.conj().T @ rows)
+
+
+def scale_by_plate(system: NormalEquations, dual: np.ndarray, u_m: float = 0.0, *,
+                   mode: int = 3) -> ScaleDatum:
+    """Return the scale that a row `dual` of the plate's map sets, complex (nx, ny).
+
+    With mode 2 the rotation instead of the scale (3).
+    """
+    grid = system.grid
+    rows = system.gauge.dual(mode).ravel() - grid.views.scatter(
+        grid.relative_weight * dual).ravel()
     sums = -np.einsum("cij,vij->vc", np.conj(grid.shapes), grid.relative_weight * dual)
     parameters = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
     total = grid.weight.sum(axis=0)
     variance = float((abs(dual) ** 2 / np.where(grid.mark_read, total, np.inf)).sum())
-    return ScaleDatum(rows, parameters, variance, u, of_plate=True)
+    return ScaleDatum(rows, parameters, variance, u_m, of_plate=True)
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,

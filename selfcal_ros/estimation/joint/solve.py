@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration by joint least squares: readings to result."""
 
+import math
 from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
@@ -22,6 +23,7 @@ from selfcal_ros.estimation.datum.covariance import (
     scale_datum,
     scale_of,
 )
+from selfcal_ros.estimation.datum.plate import angular_plate_variance, plate_covariance
 from selfcal_ros.estimation.joint.axes import MAX_SITES, axis_contrast, axis_variances
 from selfcal_ros.estimation.joint.correlated import correlated_variances, time_correlation
 from selfcal_ros.estimation.joint.fit import JointFit
@@ -45,6 +47,7 @@ from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.places import places_of
+from selfcal_ros.estimation.terms.shapes import NO_LINES
 from selfcal_ros.estimation.terms.visits import check_visits
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
@@ -54,9 +57,10 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import OF_LINES, VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import LatticePose, Plan
 
 
 def solve_joint(measurements: Measurements, options: Options) -> Solved:
@@ -146,8 +150,11 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
-    error_map, closure, kept = _error_map(measurements, options, model=model)
-    artifact_map = _artifact_map(model, options)
+    sigma = np.full(problem.system.known_sites.shape, found.xy.sigma)
+    if problem.direct and options.uncertainty is not False:
+        sigma = sigma * noise_gain(problem, found)
+    error_map, closure, kept = _error_map(measurements, options, model=model, sigma=sigma)
+    artifact_map = _artifact_map(model, options, rms(sigma))
     findings = (*_unchecked(problem.system, measurements.sense),
                 *_magnification(artifact_map, options))
     if not problem.direct and options.uncertainty is None:
@@ -236,10 +243,11 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
 
 
 def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
-               ) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
+               sigma: np.ndarray) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
-    The factors are those of `selfcal_ros.estimation.joint.solved`.
+    `sigma` is the noise of a reading as it counts at each site, m; the factors are those of
+    `selfcal_ros.estimation.joint.solved`.
     """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
@@ -255,8 +263,7 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
             variance = np.stack(cover.diagonal())
             if system.grid.n_sites <= MAX_SITES:
                 variance = variance + _structured(model, cover)
-            gain = noise_gain(problem, found) * found.xy.sigma
-            u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * gain
+            u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if wanted and model.equations is not None:
             kept = saved_terms(cover, model.equations.columns, measurements.sense)
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
@@ -289,20 +296,35 @@ def _structured(model: ModelFit, cover: FieldCovariance) -> np.ndarray | float:
     return added
 
 
-def _artifact_map(model: ModelFit, options: Options) -> ArtifactMap:
+def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> ArtifactMap:
+    """Return the plate's map; `sigma_m` is the noise of a reading as it counts there."""
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
     plate = np.where(system.known_marks, found.plate, complex(np.nan, np.nan))
     alone = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
     scale = scale_of(system, alone, field=found.field, plate=found.plate, half_width_m=length)
-    u = float("nan")
+    u, sigma = float("nan"), found.xy.sigma
+    u_x = u_y = np.full(plate.shape, np.nan)
+    u_theta = np.full(system.angular.n_lines, np.nan)
     if problem.direct and options.uncertainty is not False:
         cover = FieldCovariance(system, found.inverse, scale_datum(system, alone, length),
-                                found.xy.sigma, model.spread)
-        u = float(np.sqrt(cover.scale_variance)) * found.xy.sigma / length
+                                sigma, model.spread)
+        u = float(np.sqrt(cover.scale_variance)) * sigma / length
+    if math.isfinite(u) and all(isinstance(p, LatticePose) for p in problem.grid.poses):
+        columns, lines = np.zeros((0, *problem.grid.y.shape), dtype=complex), NO_LINES
+        if model.equations is not None:
+            columns, lines = model.equations.columns.grid, model.equations.columns.lines
+        of_plate = plate_covariance(cover, options.reference, columns=columns,
+                                    half_width_m=length, sigma_m=sigma)
+        u_x, u_y = (np.where(system.known_marks, np.sqrt(v) * sigma_m, np.nan)
+                    for v in of_plate.diagonal())
+        if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
+            u_theta = np.sqrt(angular_plate_variance(
+                cover, columns=columns, lines=(lines.at, lines.values),
+                sigma=(sigma, found.theta.sigma), half_width_m=length))
     return ArtifactMap(plate.real.copy(), plate.imag.copy(),
                        np.where(system.known_plate_lines, found.a_theta, np.nan),
-                       scale / length, u)
+                       scale / length, u, u_x, u_y, u_theta)
 
 
 def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tuple[ViewResult, ...]:

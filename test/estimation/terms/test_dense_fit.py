@@ -107,6 +107,8 @@ def require_same(result, dense, *, of_u=0.01, axes=False):
         wanted, spread = dense.theta(known, axes)
         assert np.abs(emap.u_g_theta[known] / spread[known] - 1).max() < 0.1 * of_u
         assert np.abs((emap.g_theta - wanted)[known] / spread[known]).max() < of_u
+    if not axes:
+        require_same_plate(result, dense, of_u)
     found = {(term.name, e.view, e.component): e for term in result.model.terms
              for e in term.estimates}
     coefficients = dense.coefficients()
@@ -114,6 +116,21 @@ def require_same(result, dense, *, of_u=0.01, axes=False):
     for key, (value, spread) in coefficients.items():
         assert found[key].u == pytest.approx(spread, rel=0.1 * of_u), key
         assert abs(found[key].value - value) < of_u * spread, key
+
+
+def require_same_plate(result, dense, of_u):
+    """Require the same of the plate's map."""
+    plate = result.artifact_map
+    known, sites = np.isfinite(plate.ax), np.isfinite(result.error_map.gx)
+    for value, u, wanted, spread in zip((plate.ax, plate.ay), (plate.u_ax, plate.u_ay),
+                                        *dense.plate(known, sites), strict=True):
+        assert np.abs(u[known] / spread[known] - 1).max() < 0.1 * of_u
+        assert np.abs((value - wanted)[known] / u[known]).max() < of_u
+    if result.artifact.angular_count:
+        wanted, spread = dense.plate_theta(np.isfinite(result.error_map.g_theta), sites, known)
+        known = np.isfinite(plate.a_theta)
+        assert np.abs(plate.u_a_theta[known] / spread[known] - 1).max() < 0.1 * of_u
+        assert np.abs((plate.a_theta - wanted)[known] / spread[known]).max() < of_u
 
 
 @pytest.mark.parametrize("sense", Sense)
