@@ -253,7 +253,8 @@ class Pose:
 
 def nearest_step(value: float) -> int | None:
     """Return the whole number that a value is meant to be; None if it is not near one."""
-    return round(value) if abs(value - round(value)) <= LATTICE_TOLERANCE else None
+    near = math.isfinite(value) and abs(value - round(value)) <= LATTICE_TOLERANCE
+    return round(value) if near else None
 
 
 def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:

@@ -68,6 +68,9 @@ FIXED = 1e-12
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
 
+DIVERGES = 1e6
+"""Ratio of a step to the first one beyond which they grow without end."""
+
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
@@ -185,9 +188,10 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
         check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
-    before = np.inf
+    before, first = np.inf, 0.0
     for number in range(MAX_STEPS):
         change = state.step()
+        first = first or change
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
         if change <= max(RESOLUTION * largest, ROUNDING * float(np.abs(problem.grid.y).max())):
             return state.finished()
@@ -195,6 +199,8 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
         part = OF_NOISE if number < LATE else OF_NOISE_LATE
         if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
             return state.finished()
+        if change > DIVERGES * first:
+            break
         before = change
     if problem.terms:
         free = " or ".join(str(term.name) for term in problem.terms if math.isinf(term.size))
