@@ -69,7 +69,8 @@ SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
 
 DIVERGES = 1e6
-"""Ratio of a step to the first one beyond which they grow without end."""
+"""Ratio of a step to the first one beyond which they grow without end, if it is larger than the
+readings as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,7 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
         part = OF_NOISE if number < LATE else OF_NOISE_LATE
         if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
             return state.finished()
-        if change > DIVERGES * first:
+        if change > max(DIVERGES * first, float(np.abs(problem.grid.y).max())):
             break
         before = change
     if problem.terms:
