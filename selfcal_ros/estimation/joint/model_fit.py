@@ -68,9 +68,8 @@ FIXED = 1e-12
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
 
-DIVERGES = 1e6
-"""Ratio of a step to the first one beyond which they grow without end, if it is larger than the
-readings as well."""
+DIVERGES = 1e3
+"""Ratio of a step to the largest reading above which the iteration diverges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,18 +188,17 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
         check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
-    before, first = np.inf, 0.0
+    before, peak = np.inf, float(np.abs(problem.grid.y).max())
     for number in range(MAX_STEPS):
         change = state.step()
-        first = first or change
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
-        if change <= max(RESOLUTION * largest, ROUNDING * float(np.abs(problem.grid.y).max())):
+        if change <= max(RESOLUTION * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
         part = OF_NOISE if number < LATE else OF_NOISE_LATE
         if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
             return state.finished()
-        if change > max(DIVERGES * first, float(np.abs(problem.grid.y).max())):
+        if change > DIVERGES * peak:
             break
         before = change
     if problem.terms:
@@ -218,8 +216,7 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
     if reduced is None:
         reduced = reduce_columns(problem.system.grid, columns.shapes)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
-    known = [sigma for sigma in (found.xy.declared, found.xy.repeats, found.xy.residuals)
-             if np.isfinite(sigma)]
+    known = list(filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals)))
     lines = reduce_lines(problem.system.angular, columns.lines, found.ratio, problem.half_width_m)
     return TermEquations(problem.system, columns, project(problem.system, reduced, inverse, lines),
                          min(known, default=0.0), found.ratio * problem.half_width_m**2)
@@ -397,8 +394,7 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
 
 def with_noise(problem: Problem, sums: Sums) -> Problem:
     """Return the problem with the noise that terms leave, of residuals and of visits."""
-    repeats = problem.repeats_xy
-    if sums.dof_within >= 1:
-        repeats = sigma_of(sums.within, sums.dof_within)
+    within = sums.dof_within >= 1
+    repeats = sigma_of(sums.within, sums.dof_within) if within else problem.repeats_xy
     return replace(problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
                    repeats_xy=repeats)
