@@ -32,7 +32,8 @@ class StageMap(Compensator):
     result : CalibrationResult
         The calibration; `result.verdict` states whether it is qualified.
     method, outside : str
-        As for `Compensator`; None = that of the map, bilinear on the plate's lattice.
+        As for `Compensator`; None = that of the map, bilinear on the plate's lattice and where a
+        node of the map is unknown.
 
     Raises
     ------
@@ -48,7 +49,8 @@ class StageMap(Compensator):
             raise NotIdentifiableError("the measured plan does not identify the stage; measure "
                                        "the missing views", result.observability)
         grid = result.plate.map_grid
-        own: Interpolation = "bilinear" if grid is None else grid.interpolation.value
+        whole = grid is not None and bool(result.error_map.valid.all())
+        own: Interpolation = grid.interpolation.value if grid and whole else "bilinear"
         super().__init__(result.error_map, method=method or own, outside=outside)
         self.result = result
 

@@ -14,11 +14,13 @@ from selfcal_ros.apply import StageMap, load
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import random_map, result_of
+from test.support.placed import SIX, plate, readings, rows
 from test.support.sessions import collected, events_of, small_plan
 
 EXAMPLE = Path(__file__).parents[1] / "examples/correct.py"
@@ -149,3 +151,19 @@ def test_the_example_runs(file, capsys, monkeypatch):
         "0e+00", "2e-18", "3e-18", "4e-18")]
     assert lines[4].startswith("distance 0.025000 m is indicated ")
     assert lines[5].startswith("mean error in x ")
+
+
+@pytest.mark.parametrize(("nodes", "method"), [(7, "bicubic"), (9, "bilinear")])
+def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, method):
+    """Bilinear where nodes are unknown: those of nine lie partly beyond the plate."""
+    artifact = plate(11, 7)
+    artifact = replace(artifact, map_grid=replace(artifact.map_grid, size=nodes))
+    found, _ = readings(artifact, SIX, np.random.default_rng(3))
+    result = calibrate(found, Options(assumed=()))
+    stage = StageMap(result)
+    assert stage.method == method and result.error_map.valid.all() == (nodes == 7)
+    if nodes == 7:
+        place = np.array([0.0123 - 0.031j])
+        wanted = rows(artifact, place) @ (result.error_map.gx + 1j * result.error_map.gy).ravel()
+        x, y = stage.command(place.real, place.imag)
+        assert complex(x[0], y[0]) - place[0] == pytest.approx(wanted[0], abs=1e-15)

@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--inverse", action="store_true",
                         help="the points are indicated positions: give the true ones")
     parser.add_argument("--method", choices=("bilinear", "bicubic"),
-                        help="interpolation between the nodes (default: that of the map, "
-                             "bilinear on the plate's lattice)")
+                        help="interpolation between the nodes (default: that of the map; "
+                             "bilinear on the plate's lattice, or if nodes are unknown)")
     parser.add_argument("--outside", choices=("clamp", "refuse"), default="clamp",
                         help="outside the field take the error of its edge, or refuse (default "
                              "clamp)")
