@@ -23,8 +23,8 @@ views:
 """
 VIEWS, MARKS = 4, (33, 33, 8, 28)
 NEAR_M, NEAR_RAD = 5e-8, 1e-6
-"""Largest effect on a map of the cell's noise, and of a microscope whose scale the stops do not show
-beyond the noise of the encoders (u up to 10 nm); its errors are above 4e-7 m and 5e-5 rad."""
+"""Largest effect on a map of the cell's noise, and of a microscope whose scale the stops do not
+show beyond the noise of the encoders (u up to 10 nm); its errors are above 4e-7 m and 5e-5 rad."""
 
 
 class Site:
