@@ -8,7 +8,9 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.roughness import known_places
 from selfcal_ros.model.artifact import Interpolation, MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -148,3 +150,17 @@ def test_no_noise_and_no_roughness_is_no_lack():
     result = calibrate(found, BARE)
     assert result.verdict.grade == "good" and not result.verdict.causes
     assert result.error_map.u_gx.max() < 1e-13
+
+
+def test_the_lack_of_fit_is_sought_between_known_nodes_too():
+    """One unknown corner takes away the middles beside it, and no other place."""
+    artifact = plate(11, 7)
+    found, _ = readings(artifact, SIX, np.random.default_rng(8))
+    system = fit_joint(found, BARE).problem.system
+    assert system.known_sites.all() and len(known_places(system)) == 13**2
+    system.known_sites = system.known_sites.copy()
+    system.known_sites[0, -1] = False
+    places = known_places(system) / artifact.field.grid_pitch_m
+    assert len(places) == 13**2 - 4
+    assert not (np.abs(places - (-3 + 3j)) < 0.75).any()
+    assert np.abs(places.real).max() == 3 and places.real[places.imag == 3].min() == -2

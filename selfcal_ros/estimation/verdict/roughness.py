@@ -106,6 +106,16 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     return Adequacy(p, _lack(fine, system, model.y, sigma_m), more, grid.views.shape)
 
 
+def known_places(system: PlacedEquations) -> np.ndarray:
+    """Return the known nodes and the middles between known nodes, complex (P,), m."""
+    views, known = system.grid.views, system.known_sites
+    s, t = np.indices([2 * size - 1 for size in views.shape]).reshape(2, -1)
+    low, high = (s // 2, t // 2), ((s + 1) // 2, (t + 1) // 2)
+    inside = known[low] & known[high] & known[low[0], high[1]] & known[high[0], low[1]]
+    x, y = s[inside] / 2 - views.half[0], t[inside] / 2 - views.half[1]
+    return (x + 1j * y) * views.spline.pitch_m
+
+
 def _effective(system: PlacedEquations) -> float:
     """Return the real coefficients of the map that the readings determine."""
     factor, n = system.grid.factor, system.grid.n_sites
@@ -121,12 +131,7 @@ def _lack(fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray, sigma_m
 
     One coordinate, over the nodes and the middles between them where the map is known.
     """
-    views = coarse.grid.views
-    x, j = (np.arange(-half, half + 0.25, 0.5) for half in views.half)
-    at = ((x[:, None] + 1j * j) * views.spline.pitch_m).ravel()
-    known = views.spline.rows(at) @ views.spline.coefficients(
-        (~coarse.known_sites).astype(float)).ravel()
-    at = at[np.abs(known) < 1e-6] if not coarse.known_sites.all() else at
+    at = known_places(coarse)
     rigid = Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True).orthonormal
     values, powers = [], []
     for system in (fine, coarse):
