@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.solve import fit_joint
+from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.roughness import known_places
 from selfcal_ros.model.artifact import Interpolation, MapGrid
@@ -164,3 +164,24 @@ def test_the_lack_of_fit_is_sought_between_known_nodes_too():
     assert len(places) == 13**2 - 4
     assert not (np.abs(places - (-3 + 3j)) < 0.75).any()
     assert np.abs(places.real).max() == 3 and places.real[places.imag == 3].min() == -2
+
+
+@pytest.mark.parametrize("turn", [0.1, -0.3])
+def test_readings_are_turned_back_into_the_stage_frame(turn):
+    """A step of one reading along stage x is one along x again, whatever the plate's rotation."""
+    artifact, views = plate(11, 7), []
+    rng = np.random.default_rng(9)
+    found, _ = readings(artifact, SIX, rng)
+    for view in found.views:
+        pose, mark = view.view.pose, (view.m + 1j * view.n) * 10e-3
+        lies = pose.phase * (np.exp(1j * turn) - 1) * mark
+        views.append(replace(view, dx=view.dx + lies.real, dy=view.dy + lies.imag))
+    step = np.zeros(len(views[2].m))
+    step[40] = 1e-6
+    moved = [*views[:2], replace(views[2], dx=views[2].dx + step), *views[3:]]
+    before, after = (prepare(replace(found, views=tuple(each)), BARE)[0]
+                     for each in (views, moved))
+    change = (after.grid.y - before.grid.y)[2] * before.to_stage[2]
+    at = views[2].m[40] + 5, views[2].n[40] + 5
+    assert before.turn_rad == pytest.approx(turn, abs=0.01)
+    assert change[at] == pytest.approx(1e-6, abs=0.1e-6)

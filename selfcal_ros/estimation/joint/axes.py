@@ -37,7 +37,7 @@ def axis_contrast(model: ModelFit) -> float:
             squares += visits.weight @ np.stack([rest.real, rest.imag], axis=1) ** 2
             dof += len(visits.mark) - len(np.unique(visits.mark))
     if 2 * dof < MIN_REPEAT_DOF:
-        rest = model.found.residuals * _to_stage(model)[:, None, None]
+        rest = model.found.residuals * model.problem.to_stage[:, None, None]
         weight = problem.system.grid.weight
         squares = np.array([(weight * part**2).sum() for part in (rest.real, rest.imag)])
         dof = model.found.xy.dof_residuals / 2
@@ -53,7 +53,7 @@ def axis_variances(model: ModelFit, cover: FieldCovariance) -> np.ndarray:
 
     The variance of a node is then that of equal noises plus `axis_contrast` times this.
     """
-    turn = _to_stage(model)[:, None, None] ** 2
+    turn = model.problem.to_stage[:, None, None] ** 2
     weight = model.problem.system.grid.weight
     return added_variances(model, cover, lambda rest: np.einsum(
         "vij,kvij->k", weight, (turn * rest**2).real))
@@ -82,8 +82,3 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
             rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
             values[start:start + CHUNK] = of(rest)
     return out.reshape(2, *grid.views.shape)
-
-
-def _to_stage(model: ModelFit) -> np.ndarray:
-    """Return the factor from the frame of each view's readings to the stage axes, (views,)."""
-    return model.problem.system.grid.views.phases / model.problem.frames

@@ -113,6 +113,11 @@ class Problem:
         """exp(-i turn_rad) of each grid view: from the nominal to the turned plate frame."""
         return np.exp(-1j * self.turn_rad)
 
+    @property
+    def to_stage(self) -> np.ndarray:
+        """Factor from the turned plate frame of each view's readings to the stage frame."""
+        return self.system.grid.views.phases / self.frames
+
 
 @dataclass(frozen=True, eq=False)
 class AngularPart:

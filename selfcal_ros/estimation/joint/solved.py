@@ -98,7 +98,7 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         if index in problem.grid.index:
             row = problem.grid.index.index(index)
             read = problem.grid.weight[row] > 0
-            rest = np.where(read, found.residuals[row], np.nan) * _to_stage(model, row)
+            rest = np.where(read, found.residuals[row], np.nan) * problem.to_stage[row]
             entry |= {"dx": np.round(rest.real, DECIMALS_M), "dy": np.round(rest.imag, DECIMALS_M)}
             if starts and view.visits is not None and len(view.visits.mark):
                 entry["course"] = _course(view.visits, _at_visits(model, row), min(starts))
@@ -121,13 +121,7 @@ def _at_visits(model: ModelFit, row: int) -> np.ndarray:
         values = values - model.equations.columns.at_visits(model.coefficients)[row]
     rest = model.found.residuals[row].reshape(-1)
     residual = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
-    return residual * _to_stage(model, row)
-
-
-def _to_stage(model: ModelFit, row: int) -> complex:
-    """Return the factor from the frame of a grid view's readings to the stage frame."""
-    problem = model.problem
-    return complex(problem.grid.poses[row].phase / problem.frames[row])
+    return residual * problem.to_stage[row]
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
