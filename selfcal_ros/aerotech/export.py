@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.aerotech.model import Table1D, Table2D, Unit, UnitWord
 from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.residual import require_known
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.units import ARCSEC_PER_DEG, M_PER_UM, RAD_PER_ARCSEC
@@ -41,10 +42,7 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     InputError
         If a site is unknown: a table has no holes.
     """
-    missing = int((~error_map.valid).sum())
-    if missing:
-        raise InputError("error map", f"{missing} sites are unknown, and a table has no holes",
-                         "measure them, or fill them from their neighbours (--fill)")
+    require_known(error_map)
     artifact, unit_m = error_map.artifact, frame.unit_m
     hx, hy = (half * artifact.grid_pitch_m for half in artifact.half)
     pitch = artifact.grid_pitch_m / unit_m

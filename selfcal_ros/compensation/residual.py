@@ -23,6 +23,14 @@ SETTLED = 60
 """Iterations that remove an active table; its slope is below a quarter."""
 
 
+def require_known(error_map: ErrorMap) -> None:
+    """Raise InputError if a site is unknown: a table has no holes."""
+    missing = int((~error_map.valid).sum())
+    if missing:
+        raise InputError("error map", f"{missing} sites are unknown, and a table has no holes",
+                         "measure them, or fill them from their neighbours (--fill)")
+
+
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Residuals true - commanded before and after, without their common shift.

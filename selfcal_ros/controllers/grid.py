@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
-from selfcal_ros.compensation.residual import Correction
+from selfcal_ros.compensation.residual import Correction, require_known
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 
@@ -106,10 +106,7 @@ def wanted(error_map: ErrorMap, wiring: Wiring) -> Correction:
     InputError
         If a site is unknown: a table has no holes.
     """
-    missing = int((~error_map.valid).sum())
-    if missing:
-        raise InputError("error map", f"{missing} sites are unknown, and a table has no holes",
-                         "measure them, or fill them from their neighbours (--fill)")
+    require_known(error_map)
     stage, frame = Compensator(error_map), wiring.frame
     sense = (-1.0 if wiring.negate else 1.0) / frame.unit_m
 
