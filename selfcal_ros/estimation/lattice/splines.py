@@ -57,25 +57,16 @@ class Axis:
                           for i in range(len(knots) - self.degree - 1)])
         return Axis(knots, self.degree, nodes, by_nodes=False)
 
-    def rows(self, at: np.ndarray, slope: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the B-splines at places: their values, and the index of the first, (P, degree+1).
 
-        With `slope` 1 their derivatives.
+        Places beyond the edge, which rounding moves there, count as on it.
         """
         knots, k = self.knots, self.degree
+        at = np.clip(at, knots[0], knots[-1])
         cell = np.clip(np.searchsorted(knots, at, "right") - 1, k, len(knots) - k - 2)
-        first = cell[:, None] - k + np.arange(k + 1)
-        if not slope:
-            clipped = np.clip(at, knots[0], knots[-1])
-            design = BSpline.design_matrix(clipped, knots, k)
-            values = design.data.reshape(-1, k + 1)
-            beyond = at - clipped
-            if beyond.any():  # continued straight on
-                values = values + beyond[:, None] * self.rows(clipped, 1)[0]
-            return values, first
-        unit = np.eye(len(knots) - k - 1)
-        spline = BSpline(knots, unit, k).derivative()
-        return np.take_along_axis(spline(np.clip(at, knots[0], knots[-1])), first, axis=1), first
+        values = BSpline.design_matrix(at, knots, k).data.reshape(-1, k + 1)
+        return values, cell[:, None] - k + np.arange(k + 1)
 
     @cached_property
     def from_nodes(self) -> np.ndarray:
@@ -124,20 +115,17 @@ class MapSpline:
         """Places of the unknowns on the stage, complex (nx, ny), m."""
         return (self.axes[0].nodes[:, None] + 1j * self.axes[1].nodes) * self.pitch_m
 
-    def rows(self, places_m: np.ndarray, slope: tuple[int, int] = (0, 0)) -> csr_matrix:
+    def rows(self, places_m: np.ndarray) -> csr_matrix:
         """Return the rows of places on the coefficients, real (P, nodes).
 
         Parameters
         ----------
         places_m : complex array (P,)
             Places on the stage, m.
-        slope : tuple of int
-            1 for the derivative along x or y, in 1/m.
         """
         at = places_m / self.pitch_m
-        (bx, ix), (by, iy) = (axis.rows(part, one) for axis, part, one in zip(
-            self.axes, (at.real, at.imag), slope, strict=True))
-        values = bx[:, :, None] * by[:, None, :] / self.pitch_m ** sum(slope)
+        (bx, ix), (by, iy) = self.axes[0].rows(at.real), self.axes[1].rows(at.imag)
+        values = bx[:, :, None] * by[:, None, :]
         index = ix[:, :, None] * self.shape[1] + iy[:, None, :]
         each = values[0].size if len(values) else 1
         ends = np.arange(0, len(at) * each + 1, each)
@@ -157,7 +145,3 @@ class MapSpline:
         n = len(matrix)
         half = self.adjoint(matrix.T.reshape(n, *self.shape)).reshape(n, n)
         return self.adjoint(half.T.reshape(n, *self.shape)).reshape(n, n)
-
-    def at(self, field: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-        """Return a field (nx, ny) at places (P,), m."""
-        return self.rows(places_m) @ self.coefficients(field).ravel()
