@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
+from selfcal_ros.model.artifact import (
+    Artifact,
+    Interpolation,
+    MapGrid,
+    default_map_grid,
+    map_grid_to_dict,
+)
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.pose import (
     OFF,
@@ -358,9 +364,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
     grid = artifact.map_grid
-    nodes = {} if grid is None else {"map": {
-        "grid_size": grid.size, "grid_pitch": grid.pitch_m,
-        "interpolation": str(grid.interpolation), "grid_size_y": grid.size_y}}
+    nodes = {} if grid is None else {"map": map_grid_to_dict(grid)}
     marks, offset_m = plan.check_stops
     return {"plan_id": plan.plan_id, "artifact": plate, **nodes,
             "views": [view_to_dict(view, artifact) for view in plan.views],
