@@ -96,6 +96,8 @@ RESULT = {
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
                 "size, u, unit, p, details (by name, SI units)",
+    "excluded": "effects outside U, as lines of `budget` with the source `excluded`: `u` is a "
+                "nominal size, `effect_rms`, `effect_max` what it would add to u of the XY map",
     "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "
               "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
               "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "

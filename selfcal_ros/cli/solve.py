@@ -233,8 +233,9 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 def _budget(result: Any) -> list[str]:
     """Return the budget as it is printed."""
     from selfcal_ros.estimation.verdict.uncertainty import budgets
-    from selfcal_ros.reporting.words.tables import budget_text
+    from selfcal_ros.reporting.words.tables import budget_text, excluded_text
 
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
-    return ["", *budget_text(budgets(result))]
+    return ["", *budget_text(budgets(result)),
+            *(f"not in U: {excluded_text(line)}" for line in result.excluded)]

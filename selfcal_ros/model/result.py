@@ -143,6 +143,7 @@ class Noise:
 class CalibrationResult:
     """The result of a calibration.
 
+    `excluded` are effects outside the model, with what they would add to u at a nominal size.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection.
     """
@@ -166,6 +167,7 @@ class CalibrationResult:
     run_id: str = ""
     findings: tuple[Finding, ...] = ()
     budget: tuple[BudgetLine, ...] = ()
+    excluded: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
 
     @property
@@ -268,6 +270,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "findings": plain([json_form.finding_to_dict(found) for found in result.findings]),
         "budget": plain([json_form.line_to_dict(line) for line in result.budget]),
+        "excluded": plain([json_form.line_to_dict(line) for line in result.excluded]),
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -278,7 +281,7 @@ _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "input", "map"}
+          "budget", "excluded", "input", "map"}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -330,6 +333,7 @@ def _parse(data: dict) -> CalibrationResult:
         json_form.provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
         json_form.findings_from_list(Finding, data.get("findings", [])),
         json_form.budget_from_list(data.get("budget", [])),
+        json_form.budget_from_list(data.get("excluded", [])),
         artifact if artifact.map_grid else None)
 
 

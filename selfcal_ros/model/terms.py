@@ -52,6 +52,12 @@ UNITS: dict[str, str] = {
 """Unit of each term's size: a standard deviation known from elsewhere. For a drift it is that at
 the edge of the view's time, for a shape at the middle of the plate's edge."""
 
+NOMINAL_SIZES = {
+    TermName.MICROSCOPE: 1e-3, TermName.DRIFT: 10e-9, TermName.PLATE_SCALE: 1e-6,
+    TermName.PLATE_SHAPE: 10e-9, TermName.APPROACH: 10e-9, TermName.PLATE_STRAIN: 1e-6}
+"""Sizes for which the effect of a term outside the model is stated: 1 mrad and 0.1 %, 10 nm,
+1 um/m. Terms of the marks only: lines do not affect the XY map."""
+
 OF_PLATE = (TermName.PLATE_SCALE, TermName.PLATE_SHAPE, TermName.PLATE_STRAIN)
 """Terms of the plate itself, which differ between views and turn with it."""
 

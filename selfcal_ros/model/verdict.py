@@ -151,7 +151,8 @@ class BudgetLine:
     dof : float
         Degrees of freedom; infinite if known.
     source : str
-        What gives `u`: ``readings``, or what was ``declared`` or is assumed by ``default``.
+        What gives `u`: ``readings``, or what was ``declared`` or is assumed by ``default``;
+        ``excluded`` if U does not contain it: `u` is then nominal.
     details : dict
         How it was found, by name.
     text : str

@@ -36,7 +36,7 @@ from selfcal_ros.reporting.summary.format import (
 )
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.findings import advice, line_text, unit_of, what_it_is
-from selfcal_ros.reporting.words.tables import dof_text
+from selfcal_ros.reporting.words.tables import dof_text, excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_ROWS = 200
@@ -314,7 +314,9 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
         return Chapter("Uncertainty")
     header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k", "dof")
     return Chapter("Uncertainty", sections=(Section(
-        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables))
+        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables,
+        Section("Not in U", notes=tuple(
+            printable(excluded_text(line)) for line in result.excluded))))
 
 
 def _budget_table(budget: Budget, unit: str, scale: float) -> Section:

@@ -34,14 +34,8 @@ from selfcal_ros.estimation.terms.planned import (
 )
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.statistics import rms
-from selfcal_ros.model.terms import UNITS, ModelTerm, TermName
+from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan
-
-SIZES = {TermName.MICROSCOPE: 1e-3, TermName.DRIFT: 10e-9, TermName.PLATE_SCALE: 1e-6,
-         TermName.PLATE_SHAPE: 10e-9, TermName.APPROACH: 10e-9, TermName.PLATE_STRAIN: 1e-6}
-"""Default sizes against which a plan is judged: 1 mrad and 0.1 %, 10 nm, 1 um/m.
-
-Terms of the marks only: lines do not affect the XY map."""
 
 DRAWS = 20_000
 """Draws for the power, whose standard error is at most 0.4 %."""
@@ -111,7 +105,7 @@ class PlannedTerms:
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
         ground = planned_ground(plan.artifact, plan.views, system, assumed)
-        sized = [ModelTerm(name, size) for name, size in SIZES.items()]
+        sized = [ModelTerm(name, size) for name, size in NOMINAL_SIZES.items()]
         self.every = planned_equations(system, ground, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
@@ -242,10 +236,10 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
 
 def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],
                 level: float) -> tuple[TermCheck, ...]:
-    """Return the checks against all terms; `sizes` override `SIZES`."""
+    """Return the checks against all terms; `sizes` override `NOMINAL_SIZES`."""
     own = {term.name: term.size for term in planned.model if not term.free}
-    wanted = SIZES | own | dict(sizes)
-    return tuple(planned.check(name, wanted[name], level) for name in SIZES)
+    wanted = NOMINAL_SIZES | own | dict(sizes)
+    return tuple(planned.check(name, wanted[name], level) for name in NOMINAL_SIZES)
 
 
 def _n_unseen(equations: TermEquations) -> int:

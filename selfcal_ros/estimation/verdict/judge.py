@@ -24,8 +24,9 @@ from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
+from selfcal_ros.estimation.verdict.excluded import excluded_lines
 from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
-from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, search_causes
+from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, is_searched, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     enlarged,
@@ -34,8 +35,9 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import Finding, Grade, Provenance, Verdict
+from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
 MUCH_MORE = 1.1
@@ -91,7 +93,19 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
         provenance=provenance_of(measurements, options))
-    return replace(result, budget=tuple(budget_lines(result)))
+    return replace(result, budget=tuple(budget_lines(result)),
+                   excluded=_excluded(solved, result, options))
+
+
+def _excluded(solved: Solved, result: CalibrationResult,
+              options: Options) -> tuple[BudgetLine, ...]:
+    """Return the effects outside U, in fields of which causes are always searched for."""
+    model, emap = solved.model, result.error_map
+    if model is None or not result.has_uncertainty or not np.isfinite(model.found.xy.sigma):
+        return ()
+    if not (model.problem.direct and is_searched(emap.gx.size, options, failed=False)):
+        return ()
+    return excluded_lines(model, options, rms(np.stack([emap.u_gx, emap.u_gy])))
 
 
 def _unexplained_noise(solved: Solved) -> bool:

@@ -30,6 +30,7 @@ from selfcal_ros.reporting.summary.numbers import (
     truth_figures,
 )
 from selfcal_ros.reporting.words.findings import unit_of
+from selfcal_ros.reporting.words.tables import excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -187,6 +188,7 @@ def error_section(result: CalibrationResult) -> Section:
         facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
     facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
                              (result.noise.k_xy, result.noise.dof_of("xy"))),
+              *(("not in U", printable(excluded_text(line))) for line in result.excluded),
               ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
                                                 "axes out of square by 2|O|")),
               ("scale difference", _slope_text(emap, emap.scale_difference, "R", "µm/m",

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, pla
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import NOMINAL_SIZES, ModelTerm, TermName, parse_terms
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import visit_sequence
 from test.support.dense_terms import SIGMA, Dense
@@ -41,10 +41,10 @@ def both(order, sense=Sense.MICROSCOPE_MOVES, degree=3):
 
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("order", [*ORDERS, "raster@plate"])
-@pytest.mark.parametrize("name", resistance.SIZES)
+@pytest.mark.parametrize("name", NOMINAL_SIZES)
 def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     planned, dense = both(order, sense)
-    size = {TermName.MICROSCOPE: 1e-4}.get(name, resistance.SIZES[name])
+    size = {TermName.MICROSCOPE: 1e-4}.get(name, NOMINAL_SIZES[name])
     found = planned.check(name, size, LEVEL)
     assert found.unseen_modes == dense.n_unseen([ModelTerm(name)])
     assert found.told is (found.unseen_modes == 0)
@@ -61,7 +61,7 @@ UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
 """A plate of 5 x 3 marks, and views of unlike repeats."""
 
 
-@pytest.mark.parametrize("name", resistance.SIZES)
+@pytest.mark.parametrize("name", NOMINAL_SIZES)
 @pytest.mark.parametrize("size", ["", ":1e-7"], ids=["free", "sized"])
 def test_columns_are_as_long_as_those_of_all_visits(name, size):
     """Means of marks and visits about them hold together what every visit has."""
@@ -90,7 +90,7 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
         unit = min(view.repeats for view in plan.views) ** 0.5
         assert planned.predicted(alone).rms_xy == pytest.approx(dense.gain(model) * unit, rel=1e-6)
         assert alone.rms_xy == pytest.approx(dense.gain([]) * unit, rel=1e-9)
-    sizes = resistance.SIZES | {TermName.MICROSCOPE: 1e-4}
+    sizes = NOMINAL_SIZES | {TermName.MICROSCOPE: 1e-4}
     for found in check_terms(planned, sizes, LEVEL):
         others = [term for term in model if term.name != found.name]
         held = [term for term in others if term.free]
