@@ -29,6 +29,9 @@ HELP = "check a plan of views before it is measured, or suggest views"
 SHOWN = 8
 """Default number of suggestions."""
 
+NODES_ONLY = ("readings at the nodes of the map only: to test what lies between them, give the map "
+              "nodes of its own (map:), and a view shifted by half a pitch")
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs ``check`` and ``suggest``."""
@@ -185,7 +188,8 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
-    return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan)]
+    return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan),
+            *([] if artifact.map_grid else [NODES_ONLY])]
 
 
 def _nodes_text(plan: Plan) -> list[str]:

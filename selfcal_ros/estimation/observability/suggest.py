@@ -9,6 +9,14 @@ from math import comb, inf
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.observability.any_pose import (
+    Pose,
+    best_pose,
+    pose_of_view,
+    posed,
+    reach_of,
+    start_poses,
+)
 from selfcal_ros.estimation.observability.plan_check import (
     Step,
     candidate_views,
@@ -211,7 +219,10 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     def score(views: tuple[View, ...]) -> Score:
         return score_plan(replace(judged, views=views), datum, repeats=unit, against=against)
 
-    steps = [*more_views(plan), *more_repeats(plan)]
+    views = more_views(plan)
+    if plan.artifact.map_grid:
+        views += _anywhere(plan, views, lambda added: score(added).key(criterion))
+    steps = [*views, *more_repeats(plan)]
     if against is not None and against.of_order:
         steps += other_orders(plan)
     if against is not None and against.of_microscope:
@@ -266,7 +277,53 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     finalists = finalists[:max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
     scores = [score_plan(with_lines(chosen), datum, against=against) for chosen in finalists]
     best = min(range(len(scores)), key=lambda at: scores[at].key(criterion))
-    return replace(with_lines(finalists[best]), artifact=artifact), scores[best], how
+    plan, least = with_lines(finalists[best]), scores[best]
+    if artifact.map_grid:
+        views = _moved_off_the_lattice(
+            plan.views, artifact, lambda views: score_plan(
+                replace(judged, views=views), datum, against=against).key(criterion))
+        plan = replace(judged, views=views)
+        least = score_plan(plan, datum, against=against)
+    return replace(plan, artifact=artifact), least, how
+
+
+def _anywhere(plan: Plan, steps: list[Step],
+              key: Callable[[tuple[View, ...]], tuple[float, ...]]) -> list[Step]:
+    """Return the best further view at any pose, unless it is one of `steps` on the lattice."""
+    pitch_m, added = plan.artifact.grid_pitch_m, steps[0].views[-1]
+
+    def views(pose: Pose) -> tuple[View, ...]:
+        view = posed(added, pose, pitch_m)
+        return *plan.views, replace(view, name=unused_name(view.name, plan.views))
+
+    reach = reach_of(plan.artifact)
+    starts = [pose_of_view(step.views[-1], pitch_m) for step in steps if step.views[-1].grid]
+    best = best_pose([*starts, *start_poses(reach)], reach, lambda pose: key(views(pose)))
+    return [] if best in starts else [Step(views(best)[-1], views(best))]
+
+
+def _moved_off_the_lattice(views: tuple[View, ...], artifact: Artifact,
+                           key: Callable[[tuple[View, ...]], tuple[float, ...]],
+                           ) -> tuple[View, ...]:
+    """Return the views at the best poses near theirs, changed one by one until none is better.
+
+    The first view remains: it is the frame of the others.
+    """
+    now, before, pitch_m = views, None, artifact.grid_pitch_m
+
+    def instead(views: tuple[View, ...], at: int, pose: Pose) -> tuple[View, ...]:
+        return *views[:at], posed(views[at], pose, pitch_m), *views[at + 1:]
+
+    def value(views: tuple[View, ...], at: int) -> Callable[[Pose], tuple[float, ...]]:
+        return lambda pose: key(instead(views, at, pose))
+
+    while now != before:
+        before = now
+        for at in (at for at in range(1, len(views)) if views[at].grid):
+            better = instead(now, at, best_pose([pose_of_view(now[at], pitch_m)],
+                                                reach_of(artifact), value(now, at)))
+            now = better if key(better) < key(now) else now
+    return _named(now)
 
 
 class _Searched:
