@@ -6,23 +6,18 @@ residuals as they are. Nobody knows its size, so that it is no line of the budge
 size would add to u is stated beside it.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.equations import TermEquations
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
 from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, VISIT_TERMS, ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine
 
 EXCLUDED = tuple(ModelTerm(name, NOMINAL_SIZES[name]) for name in (
     TermName.DRIFT, TermName.PLATE_SHAPE, TermName.APPROACH))
 """Terms that are not assumed by default; a change of scale is a strain, which is."""
-
-NONE = 1e-9
-"""Part of its size at which a term has no effect."""
 
 MATTERS = 0.3
 """Effect in standard uncertainties of the map, rms, below which it is not stated."""
@@ -50,24 +45,29 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
             and (visited or term.name not in VISIT_TERMS)]
     columns = term_columns(problem.ground, (*problem.terms, *more), problem.drift_degree)
     equations = equations_of(problem, model.found, columns)
-    none = columns
+    lines = []
     for term in more:
-        none = none.scaled(term.name, NONE)
-    held, lines = _variance(replace(equations, columns=none), equations.maps, model), []
-    for term in more:
-        one = replace(equations, columns=none.scaled(term.name, 1 / NONE))
-        added = np.maximum(_variance(one, equations.maps, model) - held, 0.0)
+        variance = _increase(equations, columns.rows([term.name]), model)
         lines.append(BudgetLine(
             "xy", f"term {term.name}", "B", float("nan"), term.size, UNITS[term.name],
-            float(np.sqrt(added.mean())), float(np.sqrt(added.max())), np.inf, "excluded"))
+            float(np.sqrt(variance.mean())), float(np.sqrt(variance.max())), np.inf, "excluded"))
     return tuple(sorted((line for line in lines if line.effect_rms > MATTERS * u_rms),
                         key=lambda line: -line.effect_rms))
 
 
-def _variance(equations: TermEquations, maps: np.ndarray, model: ModelFit) -> np.ndarray:
-    """Return the variance of the known nodes from all terms, (2, nodes), m^2."""
-    sigma = model.found.xy.sigma
-    values, vectors = np.linalg.eigh(equations.inverse(sigma))
-    root = vectors * np.sqrt(np.maximum(values, 0.0)) * sigma
-    moved = maps[equations.system.known_sites.ravel()] @ root
+def _increase(equations: TermEquations, rows: np.ndarray, model: ModelFit) -> np.ndarray:
+    """Return what the columns `rows` add to the variance of the known nodes, (2, nodes), m^2.
+
+    With C the covariance of the model's own coefficients, M the information and F the maps of the
+    columns: (F_t - F C M_t) (M_tt + 1/size^2 - M_t' C M_t)^-1 (F_t - F C M_t)'.
+    """
+    sigma, own = model.found.xy.sigma, slice(len(model.coefficients))
+    couple = model.covariance @ equations.unbiased[own][:, rows]
+    size = equations.columns.size[rows]  # in whose units the coefficients are of equal order
+    left = equations.unbiased[np.ix_(rows, rows)] - equations.unbiased[rows][:, own] @ couple
+    left = left * np.outer(size, size) + max(sigma, LEAST_NOISE_M) ** 2 * np.eye(len(size))
+    values, vectors = np.linalg.eigh((left + left.T) / 2)
+    root = size[:, None] * vectors * sigma / np.sqrt(np.maximum(values, LEAST_NOISE_M**2))
+    maps = equations.maps[equations.system.known_sites.ravel()]
+    moved = (maps[:, rows] - maps[:, own] @ couple) @ root
     return np.stack([(moved.real**2).sum(axis=1), (moved.imag**2).sum(axis=1)])
