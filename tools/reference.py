@@ -104,7 +104,10 @@ RESULT = {
               "default), details, text",
     "input": "file and sha256 of the bag", "solver": "how the equations were solved",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
-                        "up to 31 × 31 sites, and not with `--model none`",
+                        "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
+                        "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
+                        "microscope, (r, 4), the last two times the plate's longer half width; "
+                        "with_map: how many of them belong to the factors",
     "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
                      "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "

@@ -305,6 +305,7 @@ class DenseFit:
         pick += np.outer(np.concatenate([x, y]), self._part(sites, self.g, 3))
         here = np.concatenate([marks, self.n + marks])
         pick[here] -= (modes.T @ (modes @ pick))[here]
+        self.to_plate = pick
         return self._quantity(pick, (2, *self.artifact.shape))
 
     def _part(self, nodes, where, mode):

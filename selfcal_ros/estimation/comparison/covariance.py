@@ -37,7 +37,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     """
     emap = result.error_map
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
-    system = _system(result)
+    system = system_behind(result)
     if system is None or known.size > MAX_SITES or not np.isfinite(u).all():
         return u**2, False
     if result.method == "law":
@@ -45,8 +45,8 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
         return (u**2, False) if law is None else (_sized(law[0][np.ix_(both, both)], u), True)
     if tells_what_was_read(result) and result.model.terms and KEY not in result.extra:
         return u**2, False
-    rows = _unit_rows(known)
-    if _flipped(result):
+    rows = unit_rows(known)
+    if is_flipped(result):
         rows = rows[:, ::-1, ::-1]
     if not tells_what_was_read(result):
         cover = _field(system).of(rows)
@@ -58,7 +58,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     return _sized(cover + factors.T @ factors, u), True
 
 
-def _unit_rows(known: np.ndarray) -> np.ndarray:
+def unit_rows(known: np.ndarray) -> np.ndarray:
     """Return the functionals Gx, then Gy, at the known sites, complex (2n, nx, ny)."""
     at = np.flatnonzero(known.ravel())
     rows = np.zeros((2 * len(at), known.size), dtype=complex)
@@ -70,7 +70,7 @@ def _unit_rows(known: np.ndarray) -> np.ndarray:
 def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the covariance of Gtheta at the known lines, rad^2; variances if not available."""
     u = result.error_map.u_g_theta[known]
-    system = _system(result)
+    system = system_behind(result)
     if system is None or not system.angular.n_views or len(known) > MAX_LINES \
             or not np.isfinite(u).all():
         return u**2, False
@@ -79,7 +79,7 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
         return (u**2, False) if law is None else (_sized(law[1][np.ix_(known, known)], u), True)
     cover = theta_matrix(system, result.artifact, result.error_map.datum_theta,
                          sense=Sense(result.sense))
-    if _flipped(result):
+    if is_flipped(result):
         back = -np.arange(len(known)) % len(known)
         cover = cover[np.ix_(back, back)]
     return _sized(cover[np.ix_(known, known)], u), True
@@ -94,13 +94,13 @@ def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     """Return the standard uncertainties of O and R of a map; NaN if unknown."""
-    system = _system(result)
+    system = system_behind(result)
     if system is None:
         return float("nan"), float("nan")
     length = result.plate.grid_pitch_m * max(result.plate.half)
     if tells_what_was_read(result):
         variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
-        shear = system.gauge.shear[:, ::-1, ::-1] if _flipped(result) else system.gauge.shear
+        shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
         moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
             "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
         variance = (variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2
@@ -118,7 +118,7 @@ def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, 
     artifact, emap = result.artifact, result.error_map
     found = np.stack([emap.u_gx, emap.u_gy]) ** 2
     unit = np.stack(_field(system).diagonal())
-    if _flipped(result):
+    if is_flipped(result):
         unit = unit[:, ::-1, ::-1]
     place = np.stack([artifact.x_m, artifact.y_m]) ** 2
     good = np.isfinite(found) & np.isfinite(unit)
@@ -130,7 +130,7 @@ def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, 
     return float(noise), float(scale)
 
 
-def _flipped(result: CalibrationResult) -> bool:
+def is_flipped(result: CalibrationResult) -> bool:
     """Return whether the equations are solved for H(X) = -G(-X)."""
     return result.sense == Sense.PLATE_MOVES
 
@@ -144,14 +144,17 @@ def _field(system: NormalEquations) -> FieldCovariance:
 
 def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
     """Return the covariance of the map for unit noise, without terms of the model."""
-    noise = result.noise
-    length = result.plate.grid_pitch_m * max(result.plate.half)
-    inverse = system.inverse(bounded_ratio(system, noise.sigma_xy, noise.sigma_theta, length)
-                             if system.angular.n_views else 1.0)
-    scale = None
+    length, scale = result.plate.grid_pitch_m * max(result.plate.half), None
     if result.reference is not None:
         scale = scale_datum(system, ReferenceLength(**result.reference), length)
-    return FieldCovariance(system, inverse, scale, noise.sigma_xy)
+    return FieldCovariance(system, bounded_inverse(result, system), scale, result.noise.sigma_xy)
+
+
+def bounded_inverse(result: CalibrationResult, system: NormalEquations) -> np.ndarray:
+    """Return the covariance of the misalignments of a result for unit noise of a grid reading."""
+    length = result.plate.grid_pitch_m * max(result.plate.half)
+    return system.inverse(bounded_ratio(system, result.noise.sigma_xy, result.noise.sigma_theta,
+                                        length) if system.angular.n_views else 1.0)
 
 
 def tells_what_was_read(result: CalibrationResult) -> bool:
@@ -160,7 +163,7 @@ def tells_what_was_read(result: CalibrationResult) -> bool:
         v.read_grid is not None and v.read_angular is not None for v in result.views)
 
 
-def _system(result: CalibrationResult) -> NormalEquations | None:
+def system_behind(result: CalibrationResult) -> NormalEquations | None:
     """Return the system behind a result; None if unknown or the stage is not identified."""
     if np.isnan(result.error_map.u_gx).all() or not result.views:
         return None

@@ -157,7 +157,7 @@ def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
     turned[:n] = np.real(system.grid.response.conj().T @ turn.rows) - turn.parameters
     total = noise * (turn.variance + float(np.real(
         np.vdot(turn.rows, system.grid.factor.solve(turn.rows)))))
-    moved = _lines_of_terms(cover, lines, half_width_m)
+    moved = lines_of_terms(cover, lines, half_width_m)
     if len(columns):
         plates = plates_of_terms(cover, columns).reshape(len(columns), -1)
         moved = moved - (np.real(system.gauge.dual(2).reshape(-1).conj() @ cover.terms.fields)
@@ -177,7 +177,7 @@ def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
     return np.where(system.known_plate_lines, out, np.nan)
 
 
-def _lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
+def lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
                     half_width_m: float) -> np.ndarray:
     """Return the plate's angular map for a unit of each coefficient, (K, p), no rotation taken."""
     system, field = cover.system, -cover.terms.turned

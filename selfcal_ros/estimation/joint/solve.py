@@ -5,7 +5,7 @@ import math
 from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,20 +17,28 @@ from selfcal_ros.errors import (
 )
 from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
+from selfcal_ros.estimation.datum.both import BothCovariance
 from selfcal_ros.estimation.datum.covariance import (
     FieldCovariance,
     angular_variance,
     scale_datum,
     scale_of,
 )
-from selfcal_ros.estimation.datum.plate import angular_plate_variance, plate_covariance
+from selfcal_ros.estimation.datum.plate import (
+    angular_plate_variance,
+    lines_of_terms,
+    plate_covariance,
+    plates_of_terms,
+)
 from selfcal_ros.estimation.joint.axes import MAX_SITES, axis_contrast, axis_variances
 from selfcal_ros.estimation.joint.correlated import correlated_variances, time_correlation
 from selfcal_ros.estimation.joint.fit import JointFit
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.moving import noise_gain
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
+from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
 from selfcal_ros.estimation.joint.solved import (
+    MICROSCOPE_PARTS,
     Solved,
     angular_terms,
     kept_residuals,
@@ -43,7 +51,7 @@ from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
 from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.places import places_of
@@ -265,7 +273,8 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                 variance = variance + _structured(model, cover)
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if wanted and model.equations is not None:
-            kept = saved_terms(cover, model.equations.columns, measurements.sense)
+            kept = saved_terms(cover, model.equations.columns, measurements.sense,
+                               _beside_map(model, options, cover, measurements.sense))
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
                                   system.known_lines)
         if system.angular.n_views:
@@ -284,6 +293,30 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
     return ErrorMap(measurements.artifact.field, field.real.copy(), field.imag.copy(), u_x, u_y,
                     g_theta, u_theta, o / length, r / length,
                     problem.conditions.datum), closure, kept
+
+
+def _beside_map(model: ModelFit, options: Options, cover: FieldCovariance,
+                sense: Sense) -> dict[str, np.ndarray]:
+    """Return what a unit of each coefficient makes of the plate, the lines and the microscope."""
+    problem, columns = model.problem, cast(TermEquations, model.equations).columns
+    system, length = problem.system, problem.half_width_m
+    if system.grid.n_sites > MAX_FULL:
+        return {}
+    both = BothCovariance(system, cover.inverse, options.reference, half_width_m=length,
+                          sigma_m=model.found.xy.sigma)
+    plates = both.maps_of_terms(cover.terms.fields, plates_of_terms(cover, columns.grid))[1].T
+    lines = np.zeros((len(plates), 2, 0))
+    if system.angular.n_views:
+        of_plate = lines_of_terms(cover, (columns.lines.at, columns.lines.values), length)
+        lines = np.stack([-cover.terms.turned, of_plate]).transpose(2, 0, 1) * length
+        if sense is Sense.PLATE_MOVES:
+            lines[:, 0] = -lines[:, 0, -np.arange(lines.shape[2]) % lines.shape[2]]
+    microscope = -length * np.array([[
+        column.term == TermName.MICROSCOPE and column.component == part
+        for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)
+    return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
+                len(plates), 2, *system.grid.views.plate_shape),
+            "lines": lines, "microscope": microscope}
 
 
 def _structured(model: ModelFit, cover: FieldCovariance) -> np.ndarray | float:
@@ -310,14 +343,18 @@ def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> Artifact
         cover = FieldCovariance(system, found.inverse, scale_datum(system, alone, length),
                                 sigma, model.spread)
         u = float(np.sqrt(cover.scale_variance)) * sigma / length
-    if math.isfinite(u) and all(isinstance(p, LatticePose) for p in problem.grid.poses):
+    if math.isfinite(u):
         columns, lines = np.zeros((0, *problem.grid.y.shape), dtype=complex), NO_LINES
         if model.equations is not None:
             columns, lines = model.equations.columns.grid, model.equations.columns.lines
-        of_plate = plate_covariance(cover, options.reference, columns=columns,
-                                    half_width_m=length, sigma_m=sigma)
-        u_x, u_y = (np.where(system.known_marks, np.sqrt(v) * sigma_m, np.nan)
-                    for v in of_plate.diagonal())
+        if all(isinstance(pose, LatticePose) for pose in problem.grid.poses):
+            variance = plate_covariance(cover, options.reference, columns=columns,
+                                        half_width_m=length, sigma_m=sigma).diagonal()
+        else:
+            both = BothCovariance(system, found.inverse, options.reference, half_width_m=length,
+                                  sigma_m=sigma)
+            variance = both.placed_diagonal(plates_of_terms(cover, columns), cover.terms)
+        u_x, u_y = (np.where(system.known_marks, np.sqrt(v) * sigma_m, np.nan) for v in variance)
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
             u_theta = np.sqrt(angular_plate_variance(
                 cover, columns=columns, lines=(lines.at, lines.values),

@@ -152,6 +152,15 @@ KEY = "covariance_terms"
 MAX_SITES = 31 * 31
 """Largest field for a full covariance matrix."""
 
+BESIDE = "beside"
+"""Key of what each factor makes of other quantities: `plate` (r, 2, nx, ny), as those of the map;
+`lines` (r, 2, K), the angular maps of stage and plate, and `microscope` (r, 4), its coefficients,
+both times the longer half width of the plate. The first `with_map` belong to the factors of the
+map, the others leave the map as it is."""
+
+MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
+"""Coefficients of a microscope in their order."""
+
 NEGLIGIBLE = 1e-3
 """Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
 
@@ -165,7 +174,8 @@ LEAST = 1e-12
 """Entries of a factor below this are dropped, in units of the noise."""
 
 
-def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> dict[str, Any]:
+def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense,
+                beside: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
     """Return the factors for `CalibrationResult.extra`; empty without terms, or for large fields.
 
     Parameters
@@ -176,23 +186,40 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense) -> d
         The terms.
     sense : Sense
         What moved: the factors are in the stage frame.
+    beside : dict of float array (p, ...), optional
+        What a unit of each coefficient makes of other quantities, stage frame; see `BESIDE`.
     """
-    shape = cover.system.grid.views.shape
+    shape, beside = cover.system.grid.views.shape, beside or {}
     if cover.system.grid.n_sites > MAX_SITES:
         return {}
     maps = cover.maps_of_terms().reshape(*shape, -1)
     maps = np.where(cover.system.known_sites[..., None], maps, 0.0)
-    if sense is Sense.PLATE_MOVES:
-        maps = maps[::-1, ::-1]
+    sign = 1
+    if sense is Sense.PLATE_MOVES:  # G(X) = -H(-X), and L L' is the same for -L
+        maps, sign = maps[::-1, ::-1], -1
     both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
                            maps.imag.reshape(-1, maps.shape[2])])
-    factors, names = [], []
+    others = np.concatenate([np.zeros((0, maps.shape[2])), *(
+        values.reshape(len(values), -1).T for values in beside.values())])
+    factors, names, moved, alone = [], [], [], []
     for name, root in roots_by_term(cover.terms.covariance, columns):
-        left, size, _ = np.linalg.svd(both @ root, full_matrices=False)
+        left, size, right = np.linalg.svd(both @ root, full_matrices=False)
         kept = size > NEGLIGIBLE
         factors += list((left[:, kept] * size[kept]).T.reshape(-1, 2, *shape))
         names += [name] * int(kept.sum())
-    return {KEY: {"terms": names, "factors": rounded(np.array(factors)).tolist()}}
+        shown = right[kept].T @ right[kept]
+        moved += list((others @ root @ right[kept].T).T)
+        left, size, _ = np.linalg.svd(others @ (root - root @ shown), full_matrices=False)
+        alone += list((left * size).T[size > NEGLIGIBLE])
+    found = {"terms": names, "factors": rounded(np.array(factors)).tolist()}
+    if beside:
+        all_of = sign * np.array([*moved, *alone]).reshape(-1, len(others))
+        ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
+        found[BESIDE] = {"with_map": len(names)} | {
+            name: rounded(part.reshape(len(part), *values.shape[1:])).tolist()
+            for (name, values), part in zip(beside.items(), np.split(all_of, ends, axis=1),
+                                            strict=True)}
+    return {KEY: found}
 
 
 def rounded(values: np.ndarray) -> np.ndarray:

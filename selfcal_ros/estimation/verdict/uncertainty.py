@@ -86,7 +86,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     if (KEY in extra or placed) and result.noise.sigma_xy > 0:
         kept = extra.get(KEY, {"terms": [], "factors": []})
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
-        extra[KEY] = {"terms": [*kept["terms"], *(effect.name for effect in effects)],
+        extra[KEY] = {**kept, "terms": [*kept["terms"], *(effect.name for effect in effects)],
                       "factors": [*kept["factors"], *factors]}
     turned = dict(extra.get(ANGULAR_KEY, {}))
     for effect in effects:
