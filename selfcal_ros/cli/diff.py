@@ -26,6 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "`selfcal step-diagonal`: then squareness and scale are compared")
     parser.add_argument("--keep-scale", action="store_true",
                         help="keep the magnification: both maps have a reference length")
+    parser.add_argument("--artifact", action="store_true",
+                        help="compare the maps of the plates rather than those of the stages")
     parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
                         help="draw both maps and their difference side by side")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -46,8 +48,9 @@ def run(args: argparse.Namespace) -> int:
         if args.keep_scale:
             raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
                              "compared, not the magnification", "omit it")
-        if args.plot:
-            raise InputError("--plot", f"{args.b} has no map", "name two RESULT.json")
+        for option in ("plot", "artifact"):
+            if getattr(args, option):
+                raise InputError(f"--{option}", f"{args.b} has no map", "name two RESULT.json")
         rows = compare_with_laser(a, second, args.b)
         say(args, "\n".join([_laser_text(rows), *_grades_text([a])]),
             {**_laser_json(rows), **_grades([a])})
@@ -61,17 +64,21 @@ def run(args: argparse.Namespace) -> int:
                                  "magnification is unknown",
                                  "omit it, or solve with --reference")
     with busy("comparing"):
-        found = compare(a, b, keep_scale=args.keep_scale, names=(args.a, args.b))
+        found = compare(a, b, keep_scale=args.keep_scale, plates=args.artifact,
+                        names=(args.a, args.b))
     if args.plot:
+        from selfcal_ros.estimation.comparison.together import plate_as_map
         from selfcal_ros.reporting.figures.maps import difference_picture
         from selfcal_ros.reporting.figures.paper import save_picture
 
-        save_picture(difference_picture(a, b, {
+        one, other = ((plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b))
+        save_picture(difference_picture(one, other, {
             "gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}, _verdict_text(found)),
             args.plot)
-    say(args, _text(found, _grades_text([a, b])), {**_json(found), **_grades([a, b])})
+    say(args, _text(found, _grades_text([a, b]), args.artifact),
+        {**_json(found), **_grades([a, b])})
     datums = [result.error_map.datum_theta for result in (a, b)]
-    if datums[0] != datums[1] and not args.json and found.theta is not None:
+    if datums[0] != datums[1] and not (args.json or args.artifact) and found.theta is not None:
         print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
               "lines to the XY axes")
     for name, result in ((args.a, a), (args.b, b)):
@@ -117,9 +124,9 @@ def _json(found: MapDifference) -> dict[str, Any]:
         "dx": found.dx, "dy": found.dy, "d_theta": found.d_theta})
 
 
-def _text(found: MapDifference, grades: Sequence[str]) -> str:
+def _text(found: MapDifference, grades: Sequence[str], plates: bool) -> str:
     tx, ty = found.translation_m
-    lines = ["B minus A, datum difference removed: translation "
+    lines = [f"B minus A{', plates' if plates else ''}, datum difference removed: translation "
              f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
              f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
              f"scale {_signed(found.scale * UM_PER_M)} µm/m"

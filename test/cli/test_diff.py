@@ -89,6 +89,21 @@ def test_two_results_as_text_and_as_json(files, capsys):
                                      "uncertainties")
 
 
+def test_plates_are_compared_as_the_stages_are(files, tmp_path, capsys):
+    assert main(["diff", "--artifact", *files, "--plot", str(tmp_path / "d.svg")]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("B minus A, plates, datum difference removed: translation (+0, +0) µm")
+    assert "the maps agree" in text and "theta  rms" in text
+    assert "B − A" in (tmp_path / "d.svg").read_text()
+    assert main(["diff", "--artifact", *files, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["significance_xy"]["correlated"] and found["significance_theta"]["correlated"]
+    a, b = (np.array(read_json(path)["artifact_map"]["ax"]) for path in files)
+    assert np.array(found["dx"]) == pytest.approx(b - a, abs=5e-8)  # less a turn and a scale
+    assert main(["diff", files[0], files[1]]) == 0
+    assert "translation (+1, " in capsys.readouterr().out
+
+
 def test_the_grades_of_both_and_what_enlarged_them_are_shown(files, capsys):
     enlarged = result_from_dict(read_json(files[1]), "b")
     verdict = Verdict(Grade.ENLARGED, enlarged_by=(

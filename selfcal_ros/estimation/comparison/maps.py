@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of two maps after removing the datum difference, with its significance."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
@@ -12,6 +14,11 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
     theta_covariance,
     xy_covariance,
+)
+from selfcal_ros.estimation.comparison.together import (
+    plate_as_map,
+    plate_covariance,
+    plate_theta_covariance,
 )
 from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
@@ -208,7 +215,7 @@ class MapDifference:
 
 @one_thread()
 def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = False,
-            names: tuple[str, str] = ("A", "B")) -> MapDifference:
+            plates: bool = False, names: tuple[str, str] = ("A", "B")) -> MapDifference:
     """Compare two calibrations of the same lattice.
 
     Parameters
@@ -217,6 +224,8 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
         The calibrations; the difference is B minus A.
     keep_scale : bool
         Keep magnification in the difference: both maps have their own scale.
+    plates : bool
+        Compare the maps of the plates rather than those of the stages.
     names : tuple of str
         For messages.
 
@@ -225,6 +234,10 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     InputError
         If the lattices differ or no site is known in both.
     """
+    results, covariance, of_theta = (a, b), xy_covariance, theta_covariance
+    if plates:
+        a, b = plate_as_map(a), plate_as_map(b)
+        covariance, of_theta = plate_covariance, plate_theta_covariance
     require_same_lattice(a.artifact, b.artifact, names)
     artifact = a.artifact
     difference = np.stack([b.error_map.gx - a.error_map.gx, b.error_map.gy - a.error_map.gy])
@@ -239,13 +252,14 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     rest = difference - np.tensordot(parts, modes, axes=1)
     d_theta = b.error_map.g_theta - a.error_map.g_theta
     constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
-    xy = significance(rest[:, known].ravel(), [xy_covariance(r, known) for r in (a, b)], basis,
+    xy = significance(rest[:, known].ravel(), [covariance(r, known) for r in results], basis,
                        _noise_dof(a, b, "xy"))
     return MapDifference(
         rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
         0.0 if keep_scale else float(parts[3]), constant,
         b.error_map.nonorthogonality - a.error_map.nonorthogonality,
-        b.error_map.scale_difference - a.error_map.scale_difference, xy, _theta_test(a, b, d_theta))
+        b.error_map.scale_difference - a.error_map.scale_difference, xy,
+        _theta_test(a, b, d_theta, [partial(of_theta, r) for r in results]))
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
@@ -261,13 +275,14 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
                          "compare maps of the same plate")
 
 
-def _theta_test(a: CalibrationResult, b: CalibrationResult,
-                d_theta: np.ndarray) -> Significance | None:
+def _theta_test(a: CalibrationResult, b: CalibrationResult, d_theta: np.ndarray,
+                covariances: Sequence[Callable[[np.ndarray], tuple[np.ndarray, bool]]]
+                ) -> Significance | None:
     known = np.isfinite(d_theta)
     if known.sum() < 2:
         return None
     values = d_theta[known] - d_theta[known].mean()
-    return significance(values, [theta_covariance(r, known) for r in (a, b)],
+    return significance(values, [covariance(known) for covariance in covariances],
                          np.ones((int(known.sum()), 1)), _noise_dof(a, b, "theta"))
 
 

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plates compared: their difference without datum, and its significance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.comparison.together import plate_covariance
+from selfcal_ros.estimation.datum.modes import datum_modes
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support import placed
+from test.support.lattice_plans import plan_of
+from test.support.options import BARE
+
+PLAN = plan_of("0,90,tx", Artifact(5, 0.01, 8), lines=1)
+DRAWS = 150
+
+
+def calibrated(truth, rng):
+    return calibrate(simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
+                     BARE)
+
+
+def test_plates_measured_twice_agree_five_times_in_hundred():
+    """On two machines, with lines: two tests of 5 %, each a little below."""
+    machines = [random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k))
+                for k in (1, 2)]
+    machines[1] = replace(machines[1], a=machines[0].a, a_theta=machines[0].a_theta)
+    xy = theta = 0
+    for seed in range(DRAWS):
+        rng = np.random.default_rng(seed)
+        found = compare(*(calibrated(truth, rng) for truth in machines), plates=True)
+        assert found.xy.correlated and found.theta.correlated
+        xy, theta = xy + found.xy.significant, theta + found.theta.significant
+    assert 1 <= xy <= 16 and 1 <= theta <= 16  # 5 %: 7.5 +- 2.7 of 150
+
+
+def test_what_differs_is_found_without_motion_and_scale():
+    rng, truth = np.random.default_rng(1), random_truth(
+        PLAN.artifact, len(PLAN.views), np.random.default_rng(3))
+    moved = np.zeros((2, 5, 5))
+    moved[0, 1, 3] = 4e-7
+    modes = datum_modes(PLAN.artifact, scale=True)
+    other = replace(truth, a=truth.a + moved + np.tensordot([2e-7, 0, 3e-6, 4e-6], modes, axes=1))
+    found = compare(calibrated(truth, rng), calibrated(other, rng), plates=True)
+    flat = modes.reshape(4, -1).T
+    wanted = moved.ravel() - flat @ np.linalg.lstsq(flat, moved.ravel(), rcond=None)[0]
+    assert np.stack([found.dx, found.dy]).ravel() == pytest.approx(wanted, abs=1.2e-7)
+    assert found.xy.significant and found.theta.significant is False
+    assert found.scale == pytest.approx(4e-6, abs=1.5e-6)
+
+
+def test_u_off_the_lattice_is_what_each_reading_does_to_the_plate():
+    artifact = placed.plate(7, 5)
+    whole, _ = placed.readings(artifact, placed.SIX[:4], np.random.default_rng(1), linear=True)
+    options = replace(BARE, misalignment_model="linear", causes=False)
+    result, maps = calibrate(whole, options), []
+    for index, view in enumerate(whole.views):
+        for name in ("dx", "dy"):
+            for at in range(len(view.m)):
+                views = list(whole.views)
+                views[index] = replace(view, **{
+                    name: getattr(view, name) + 1e-7 * (np.arange(len(view.m)) == at)})
+                plate = calibrate(replace(whole, views=tuple(views)),
+                                  replace(options, uncertainty=False)).artifact_map
+                maps.append(np.concatenate([plate.ax.ravel(), plate.ay.ravel()]))
+    plate = result.artifact_map
+    centre = np.concatenate([plate.ax.ravel(), plate.ay.ravel()])
+    each = (np.array(maps) - centre) / 1e-7 * result.noise.sigma_xy
+    wanted, known = each.T @ each, np.isfinite(plate.ax)
+    u = np.concatenate([plate.u_ax.ravel(), plate.u_ay.ravel()])
+    assert known.all()
+    assert u == pytest.approx(np.sqrt(np.diag(wanted)), rel=1e-6)
+    cover, correlated = plate_covariance(result, known)
+    assert correlated
+    assert np.abs(cover - wanted).max() < 1e-5 * wanted.max()
