@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import SCHEMA, CalibrationResult
@@ -39,6 +40,8 @@ from selfcal_ros.reporting.words.findings import advice, line_text, unit_of, wha
 from selfcal_ros.reporting.words.tables import dof_text, excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
+MAX_MARKS = 51 * 51
+"""Largest plate whose components are shown."""
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""
 TITLES = {"outliers": "Marks removed or weighted down", "validation": "Held-out validation",
@@ -246,7 +249,7 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
     """
     found = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
-        _causes(result), _maps(result, truth), _uncertainty(result), *more,
+        _causes(result), _maps(result, truth), _uncertainty(result), *more, _plate(result),
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
             (plan_figure(result.plate, views_in(result)) if result.views else None,
@@ -298,6 +301,22 @@ def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> 
     if truth is not None:
         tables.append(sections.truth_section(result.error_map, truth))
     return Chapter("Map", _figures(*pairs), tuple(tables))
+
+
+def _plate(result: CalibrationResult) -> Chapter:
+    """Return the map of the plate, shown as that of the stage."""
+    plate = plate_as_map(result)
+    if not plate.error_map.valid.any():
+        return Chapter("Plate")
+    pairs: list[tuple[Drawing | None, str]] = [
+        (error_map(plate, of="plate"), "Each vector leads from where a mark should be on the plate "
+                                       "to where it is.")]
+    if plate.artifact.m.size <= MAX_MARKS:
+        pairs.append((component_maps(plate, of="plate"), "Ax and Ay at one scale, and below how "
+                                                         "well each is known."))
+    if np.isfinite(plate.error_map.g_theta).any():
+        pairs.append((angular_map(plate, of="plate"), "Error of the angle of every line."))
+    return Chapter("Plate", _figures(*pairs))
 
 
 def _uncertainty(result: CalibrationResult) -> Chapter:

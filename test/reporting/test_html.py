@@ -54,7 +54,7 @@ def test_report_is_whole_and_needs_nothing_from_outside():
     page = parsed(html)
     assert page.addresses and all(a.startswith("#") for a in page.addresses)
     assert all(f'id="{a[1:]}"' in html for a in page.addresses)
-    assert page.tags.count("svg") == 5
+    assert page.tags.count("svg") == 8
     assert not {"script", "link", "iframe", "object", "img"} & set(page.tags)
     assert "url(" not in html and "@import" not in html
     assert "default-src 'none'" in html
@@ -161,7 +161,7 @@ def test_unknown_maps_and_plates_without_lines():
     emap = replace(result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing,
                    nonorthogonality=np.nan, scale_difference=np.nan)
     page = parsed(html_of(replace(result, error_map=emap, views=())))
-    assert page.tags.count("svg") == 2
+    assert page.tags.count("svg") == 4
     assert "not known" in " ".join(page.text)
     assert "θ datum" not in page.text
 

@@ -26,6 +26,9 @@ LEFT, TOP, SIDE = 58.0, 40.0, 336.0
 MAX_SPOTS = 31
 """Sites along a side up to which a pointer shows their values."""
 
+ERRORS = {"stage": "G = indicated − true", "plate": "A = true − nominal"}
+"""Error of what a map is of."""
+
 CENTRE: draw.Point = (240.0, 232.0)
 ZERO, ROOM = 112.0, 66.0
 """Radius of the circle of no error, and of the largest error above it; pixels."""
@@ -111,10 +114,10 @@ def _origin(result: CalibrationResult) -> str:
 
 
 def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
-              title: str = "Error of the stage, G = indicated − true") -> draw.Drawing:
-    """Return the vectors of G over their lengths in colour, with U around their heads.
+              title: str = "", of: str = "stage") -> draw.Drawing:
+    """Return the vectors of a map over their lengths in colour, with U around their heads.
 
-    A known truth is drawn beneath.
+    A known truth is drawn beneath. `of` is a key of `ERRORS`.
     """
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
@@ -131,7 +134,8 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     fields = [shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
               for g in (vars(emap), truth) if g is not None]
     tips = [at + field * factor * MM_PER_M for field in fields]
-    drawing = parts.titled("error-map", title)
+    drawing = parts.titled(f"{'error' if of == 'stage' else of}-map",
+                           title or f"Error of the {of}, {ERRORS[of]}")
     frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
     scale = parts.Scale("e", 0.0, parts.round_end(length * UM_PER_M))
     parts.cells(frame, artifact, length * UM_PER_M, scale)
@@ -142,10 +146,10 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     if _ellipses(frame, tips[0], around):
         entries.append(("band", f"U, k = {k:.3g}"))
     parts.arrows(frame, at, fields[0], factor)
-    frame.axes(x_label="stage x in mm", y_label="stage y in mm")
+    frame.axes(x_label=f"{of} x in mm", y_label=f"{of} y in mm")
     left, top, width, height = frame.box
     parts.scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
-    _spots(frame, result)
+    _spots(frame, result, ERRORS[of][0])
     parts.arrow_key(frame, factor, (LEFT, top + height + 58))
     thin = "" if step == 1 else f", every {parts.ordinal(step)} site"
     drawing.label(LEFT + 130, top + height + 62, f"vectors enlarged {factor:,.0f} ×{thin}"
@@ -175,7 +179,7 @@ def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     return True
 
 
-def _spots(frame: draw.Frame, result: CalibrationResult) -> None:
+def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
     """Add tooltips with the values of each site, unless the field is too large."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     if max(artifact.shape) > MAX_SPOTS:
@@ -186,19 +190,26 @@ def _spots(frame: draw.Frame, result: CalibrationResult) -> None:
         gx, gy, ux, uy = (significant(float(part[index]) * scale) for part, scale in (
             (emap.gx, UM_PER_M), (emap.gy, UM_PER_M), (emap.u_gx, k * UM_PER_M),
             (emap.u_gy, k * UM_PER_M)))
-        words = UNKNOWN if gx == UNKNOWN else f"Gx {gx} ± {ux} µm, Gy {gy} ± {uy} µm (k = {k:.3g})"
+        words = UNKNOWN if gx == UNKNOWN else (
+            f"{name}x {gx} ± {ux} µm, {name}y {gy} ± {uy} µm (k = {k:.3g})")
         frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
 
 
-def component_maps(result: CalibrationResult) -> draw.Drawing:
-    """Return Gx and Gy at one scale, and below them their U at a scale of its own."""
+def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Drawing:
+    """Return Gx and Gy at one scale, and below them their U at a scale of its own.
+
+    `of` is a key of `ERRORS`: of a plate they are Ax and Ay.
+    """
     emap, k = result.error_map, result.noise.k_xy
     errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
     u = np.where(emap.valid, np.stack([emap.u_gx, emap.u_gy]), np.nan) * k * UM_PER_M
     end, side, gap, left, top = parts.round_end(errors), 158.0, 44.0, 44.0, 50.0
-    drawing = parts.titled("components", f"Components of the error, and their U with k = {k:.3g}")
-    for names, pair, scale in ((("Gx", "Gy"), errors, parts.Scale("d", -end, end)),
-                               (("U(Gx)", "U(Gy)"), u, parts.range_scale("v", u))):
+    drawing = parts.titled(
+        "components" if of == "stage" else f"{of}-components",
+        f"Components of the error, and their U with k = {k:.3g}")
+    both = [ERRORS[of][0] + axis for axis in "xy"]
+    for names, pair, scale in ((both, errors, parts.Scale("d", -end, end)),
+                               ([f"U({name})" for name in both], u, parts.range_scale("v", u))):
         for column, (name, values) in enumerate(zip(names, pair, strict=True)):
             box = (left + column * (side + gap), top, side)
             frame = parts.map_frame(drawing, result.artifact, box)
@@ -219,13 +230,14 @@ def component_maps(result: CalibrationResult) -> draw.Drawing:
 
 def angular_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
                 title: str = "Error in θ in arcsec, outwards = counter-clockwise",
-                ) -> draw.Drawing:
+                of: str = "stage") -> draw.Drawing:
     """Return the angular error around the circle, with its expanded uncertainty as a band."""
     emap, k = result.error_map, result.noise.k_theta
     error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
     true = None if truth is None or truth.get("g_theta") is None else np.asarray(
         truth["g_theta"]) * ARCSEC_PER_RAD
-    drawing = parts.titled("angular-map", title, CENTRE[1] + 230)
+    drawing = parts.titled("angular-map" if of == "stage" else f"{of}-angular", title,
+                           CENTRE[1] + 230)
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
     known = np.concatenate(curves)
     known = known[np.isfinite(known)]
