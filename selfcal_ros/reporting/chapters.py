@@ -36,7 +36,8 @@ from selfcal_ros.reporting.summary.format import (
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.findings import advice, line_text, unit_of, what_it_is
+from selfcal_ros.reporting.words.budget import line_text
+from selfcal_ros.reporting.words.findings import advice, unit_of, what_it_is
 from selfcal_ros.reporting.words.tables import dof_text, excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 

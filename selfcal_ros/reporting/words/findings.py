@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import TermName
-from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
     MM_PER_M,
@@ -318,32 +318,6 @@ def sentence_of(found: Finding) -> str:
     if not isinstance(found, Cause):
         raise KeyError(f"no words for {found.name}")
     return f"{what_it_is(found)}: {advice(found)}"
-
-
-_NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
-           "declared": "declared by the detections"}
-
-
-def line_text(line: BudgetLine) -> str:
-    """Return how a line of the budget was found."""
-    of = line.details
-    if "by" in of:
-        return _NOISES[of["by"]] + (", the larger of two that contradict each other (see the "
-                                    "verdict)" if of["contradicted"] else "")
-    if "given" in of:
-        given = f"size {of['given']:.3g}, " + (
-            "of which the readings" if of["allowed"] is None else
-            f"which the readings contradict; of {of['allowed']:.3g}, which they allow, they")
-        return f"{given} leave {of['remaining']:.0%}"
-    if "cause" in of:
-        return f"effect of the cause '{of['cause']}' that the readings show (see the verdict)"
-    if "kind" in of:
-        return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
-    if line.component == INTERPOLATION:
-        nodes = "sites" if line.quantity == "xy" else "lines"
-        return f"curvature of the map; assumes that it is smooth between {nodes}"
-    return ("no noise was found" if line.unit != "m/m" else
-            "none: the scale is a convention, and not part of the map")
 
 
 def worded(result: CalibrationResult) -> CalibrationResult:
