@@ -113,6 +113,12 @@ RESULT = {
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
                  "{time_s, dx, dy, count} over the view's time"}
 SOMETIMES = {
+    "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "
+                "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
+                "(_theta)",
+    "map_covariance": "`selfcal combine`: covariance of a mean map up to 21 × 21 sites, lower "
+                      "triangles over Gx, then Gy, of the known sites (`xy`) and over the known "
+                      "lines (`theta`), in units of scale_xy (m²), scale_theta (rad²)",
     "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",

@@ -18,6 +18,8 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, Provenance, Verdict
 
 SCHEMA = "selfcal.result/1"
+COMBINED = "combined"
+"""Method of a mean of several results, and key of the runs behind it."""
 LARGEST = 1e3
 """Larger errors and uncertainties, in m or rad, are invalid: sums of their squares overflow."""
 

@@ -12,7 +12,7 @@ from selfcal_ros import __version__
 from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.result import SCHEMA, CalibrationResult
+from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
@@ -195,7 +195,8 @@ def provenance_section(result: CalibrationResult) -> Section:
     source = result.input
     facts = [(_words(key), printable(value)) for key, value in source.items() if value]
     facts += [("method", {"joint": "joint least squares of all readings",
-                          "law": "Hu's closed-form law"}.get(result.method,
+                          "law": "Hu's closed-form law",
+                          COMBINED: "weighted mean of several calibrations"}.get(result.method,
                                                              printable(result.method))),
               ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
     made = result.provenance

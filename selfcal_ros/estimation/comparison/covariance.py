@@ -28,6 +28,9 @@ from selfcal_ros.model.view import View
 
 MAX_LINES = 1024
 """Largest number of lines for a full covariance matrix."""
+COVARIANCE = "map_covariance"
+"""Key of the covariance of a mean map: lower triangles over Gx, then Gy, of the known sites (`xy`),
+and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta` (rad^2)."""
 
 
 def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -37,6 +40,8 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     """
     emap = result.error_map
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
+    if "xy" in (stored := result.extra.get(COVARIANCE, {})):
+        return _stored(stored, "xy", np.tile(emap.valid, (2, 1)), np.tile(known, (2, 1)))
     system = system_behind(result)
     if system is None or known.size > MAX_SITES or not np.isfinite(u).all():
         return u**2, False
@@ -70,6 +75,8 @@ def unit_rows(known: np.ndarray) -> np.ndarray:
 def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the covariance of Gtheta at the known lines, rad^2; variances if not available."""
     u = result.error_map.u_g_theta[known]
+    if "theta" in (stored := result.extra.get(COVARIANCE, {})):
+        return _stored(stored, "theta", np.isfinite(result.error_map.g_theta), known)
     system = system_behind(result)
     if system is None or not system.angular.n_views or len(known) > MAX_LINES \
             or not np.isfinite(u).all():
@@ -83,6 +90,25 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
         back = -np.arange(len(known)) % len(known)
         cover = cover[np.ix_(back, back)]
     return _sized(cover[np.ix_(known, known)], u), True
+
+
+def _stored(stored: dict[str, Any], kind: str, valid: np.ndarray,
+            known: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the stored covariance of the known values, which are among the valid ones."""
+    n = int(valid.sum())
+    try:
+        values = np.array(stored[kind], dtype=float) * float(stored[f"scale_{kind}"])
+        good = values.shape == (n * (n + 1) // 2,) and bool(np.isfinite(values).all())
+    except (TypeError, ValueError, KeyError):
+        good = False
+    if not good:
+        raise InputError(COVARIANCE, "no covariance of this map",
+                         "write the map again with `selfcal combine`")
+    full = np.zeros((n, n))
+    full[np.tril_indices(n)] = values
+    full = full + np.tril(full, -1).T
+    chosen = known[valid]
+    return full[np.ix_(chosen, chosen)], True
 
 
 def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:

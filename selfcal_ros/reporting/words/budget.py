@@ -21,6 +21,10 @@ def line_text(line: BudgetLine) -> str:
         return f"{given} leave {of['remaining']:.0%}"
     if "cause" in of:
         return f"effect of the cause '{of['cause']}' that the readings show (see the verdict)"
+    if "runs" in of:
+        return {"between runs": f"scatter of {of['runs']} runs beyond their uncertainties",
+                "shared by all runs": "declared or assumed, the same in all runs"}.get(
+                    line.component, f"uncertainties of {of['runs']} runs, by their weights")
     if "kind" in of:
         return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
     if line.component == INTERPOLATION:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from selfcal_ros.model.result import CalibrationResult, Noise
+from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words.budget import line_text
@@ -177,7 +177,15 @@ SENTENCES: dict[str, Words] = {
     "prediction_failed": lambda f, of: (
         f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
         f"beyond the limit of {of['limit']:.2f}"),
+    "between_runs": lambda f, of: (
+        f"the {of['runs']} runs differ by more than their uncertainties: a part of "
+        f"{f.size * (UM if f.unit == 'm' else ARCSEC).per_si:.3g} "
+        f"{(UM if f.unit == 'm' else ARCSEC).name} (rms) between runs, p = {f.p:.2g}, is in U"),
+    "enlarged_runs": lambda f, of: (
+        f"the uncertainty of {', '.join(of['runs'])} was enlarged"),
     # what was left out, or could not be done
+    "not_in_all": lambda f, of: (
+        f"sites that are not known in all runs are unknown in the mean: {of['sites']}"),
     "no_uncertainty": lambda f, of: (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
     "visited_once": lambda f, of: (
@@ -331,7 +339,10 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     findings = tuple(map(_with_text, result.findings))
     new = (found.text for found, old in zip(findings, result.findings, strict=True)
            if not old.text)
-    return replace(result, verdict=worded_verdict(result.verdict, result.noise),
+    verdict = worded_verdict(result.verdict, result.noise)
+    if result.method == COMBINED and verdict.grade is Grade.GOOD:
+        verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
+    return replace(result, verdict=verdict,
                    findings=findings, warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))
 

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map of other origin: a table of errors with their uncertainties, as `selfcal table` writes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import csv_cells
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap
+
+OFF_SITE = 0.01
+"""Largest distance of a position in a table from its site, in pitches (of a line, in spacings)."""
+XY = ("x", "y", "gx", "gy", "u_gx", "u_gy")
+THETA = ("angle", "g_theta", "u_g_theta")
+
+
+class _Row(NamedTuple):
+    place: str
+    cells: dict[str, float]
+
+
+def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
+    """Return the map in a table, on the sites of a lattice.
+
+    Parameters
+    ----------
+    text : str
+        CSV with the columns x, y, gx, gy, u_gx, u_gy, with or without ``_m``, and optionally
+        angle, g_theta, u_g_theta, with or without ``_rad``; SI units, u with k = 1, an empty
+        cell = unknown. Other columns are ignored.
+    where : str
+        File name, for messages.
+    artifact : Artifact
+        Lattice of the map; sites and lines that the table does not have are unknown.
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read, a position is not a site, or two rows are one site.
+    """
+    grid = {name: np.full(artifact.shape, np.nan) for name in XY[2:]}
+    circle = {name: np.full(artifact.angular_count, np.nan) for name in THETA[1:]}
+    seen: set[tuple[int, ...]] = set()
+    for row in _rows(text, where):
+        is_site = np.isfinite([row.cells["x"], row.cells["y"]]).all()
+        at = _site(row, artifact) if is_site else _line(row, artifact)
+        if at in seen:
+            raise InputError(row.place, "its site is in the table twice", "delete one of the rows")
+        seen.add(at)
+        for name, values in (grid if is_site else circle).items():
+            values[at] = row.cells[name]
+            if name.startswith("u_") and (values[at] <= 0 or values[at] > 1):
+                raise InputError(row.place, f"{name} {values[at]:g} is no standard uncertainty",
+                                 "give it in m (rad), k = 1")
+    known = np.isfinite(list(grid.values())).all(axis=0)
+    if not known.any():
+        raise InputError(where, "no site has an error and its uncertainty",
+                         "fill the columns gx, gy, u_gx, u_gy")
+    gx, gy, u_gx, u_gy = (np.where(known, values, np.nan) for values in grid.values())
+    return ErrorMap(artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"])
+
+
+def _rows(text: str, where: str) -> list[_Row]:
+    """Return the rows of a table: known columns by name, NaN where empty or missing."""
+    lines = [(f"{where}:{number}", line) for number, line in enumerate(text.splitlines(), 1)
+             if line.strip(", ")]
+    head = [cell.lower().removesuffix("_m").removesuffix("_rad")
+            for cell in csv_cells(lines[0][1], lines[0][0])] if lines else []
+    missing = [name for name in XY if name not in head]
+    if missing:
+        raise InputError(f"{where}:1", f"no column {', '.join(missing)}",
+                         "give x, y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes")
+    found = []
+    for place, line in lines[1:]:
+        cells = csv_cells(line, place)
+        if len(cells) != len(head):
+            raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
+        try:
+            values = {name: float(cell) if cell else np.nan
+                      for name, cell in zip(head, cells, strict=True) if name in (*XY, *THETA)}
+        except ValueError:
+            raise InputError(place, "a cell is not a number", "correct the line") from None
+        if any(abs(value) > 1e3 for value in values.values()):
+            raise InputError(place, "a value beyond 1000 m or rad", "give m and rad")
+        found.append(_Row(place, dict.fromkeys((*XY, *THETA), np.nan) | values))
+    return found
+
+
+def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:
+    steps = np.array([row.cells["x"], row.cells["y"]]) / artifact.grid_pitch_m + artifact.half
+    at = np.rint(steps)
+    if np.abs(steps - at).max() > OFF_SITE or (at < 0).any() or (at >= artifact.shape).any():
+        raise InputError(row.place, f"({row.cells['x']:g}, {row.cells['y']:g}) m is no site of the "
+                         "other maps", "give the errors at their sites")
+    return tuple(at.astype(int).tolist())
+
+
+def _line(row: _Row, artifact: Artifact) -> tuple[int, ...]:
+    step = row.cells["angle"] / (2 * np.pi) * artifact.angular_count
+    if not abs(step - np.rint(step)) <= OFF_SITE or not 0 <= np.rint(step) < artifact.angular_count:
+        raise InputError(row.place, "neither a site nor an angular line of the other maps",
+                         "give x and y, or the angle, of one")
+    return (int(np.rint(step)),)

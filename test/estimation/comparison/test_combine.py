@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps combined: weights, what is shared, the part between runs, coverage, false alarms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from selfcal_ros.apply import StageMap
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.between import Run, mean_of, variance_between
+from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
+from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
+from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.json_form import plain
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.options import bare
+from tools.combining import ARTIFACT, Case, combined, judged
+
+NO_SHAPES = np.zeros((4, 0))
+
+
+def run_of(values, variance, *, common=0.0, shares=True, dof=np.inf):
+    values = np.asarray(values, dtype=float)
+    n = len(values)
+    return Run(values, variance * np.eye(n), common * np.ones((n, n)), shares, dof, True)
+
+
+def calibrated(seed, *, options=None, artifact=ARTIFACT, truth=None, sigma=2e-8):
+    rng = np.random.default_rng(seed)
+    truth = truth or random_truth(artifact, 4, np.random.default_rng(99))
+    readings = simulate_measurements(truth, hu_plan(artifact, 2), rng, sigma_m=sigma,
+                                     sigma_theta_rad=2e-5)
+    return calibrate(readings, options or bare(causes=False))
+
+
+def part(name, result):
+    return Part(name, result.error_map, result)
+
+
+A, B, C = (calibrated(seed) for seed in (1, 2, 3))
+
+
+def test_weights_are_inverse_variances_and_what_is_shared_does_not_average_out():
+    """Two runs of variance 1 and 3, no scatter between them, and a common error of variance 4."""
+    values = np.array([1.0, -1.0, 2.0, 0.0])
+    runs = [run_of(values, 1.0, common=4.0), run_of(values, 3.0, common=4.0)]
+    found = mean_of(runs, np.zeros((4, 0)), NO_SHAPES)
+    np.testing.assert_allclose(found.weights, [0.75, 0.25])
+    np.testing.assert_allclose(found.values, values)
+    np.testing.assert_allclose(found.covariance, 0.75 * np.eye(4) + 4.0, rtol=1e-12)
+    np.testing.assert_allclose(found.u, np.sqrt(4.75))
+    assert not found.between.any()
+    other = mean_of([runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES)
+    np.testing.assert_allclose(other.covariance, 0.75 * np.eye(4) + 0.75**2 * 4.0)
+
+
+def test_the_common_part_cancels_between_runs_of_one_machine_alone():
+    """E_n of two runs: the difference over its U, where a common error counts for others only."""
+    runs = [run_of([2.0, 0, 0, 0], 1.0, common=8.0), run_of(np.zeros(4), 1.0, common=8.0)]
+    alike = mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[0]
+    assert alike.e_n[0] == pytest.approx(2 / (2.0 * np.sqrt(2)), rel=1e-3)
+    of_other = mean_of([runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES)
+    assert of_other.deviations[0].e_n[0] == pytest.approx(2 / (2.0 * np.sqrt(10)), rel=1e-3)
+    assert alike.e_n[0] == -mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[1].e_n[0]
+
+
+def test_mandel_and_paule_for_equal_variances_is_a_difference_of_variances():
+    """Sample variance of 1, 2, 6 is 7: with 3 within the runs 4 are left between, with 8 none."""
+    values = np.array([[1.0], [2.0], [6.0]])
+    assert variance_between(values, np.full(3, 3.0)) == pytest.approx(4.0)
+    assert variance_between(values, np.full(3, 8.0)) == 0.0
+    unequal = variance_between(values, np.array([1.0, 2.0, 3.0]))
+    weight = 1 / (np.array([1.0, 2.0, 3.0]) + unequal)
+    assert weight @ (values[:, 0] - weight @ values[:, 0] / weight.sum()) ** 2 == pytest.approx(2.0)
+
+
+def test_scatter_in_a_shape_enters_u_with_the_pattern_of_that_shape():
+    shape = np.array([[3.0], [1.0], [-1.0], [-3.0]])
+    runs = [run_of(amplitude * shape[:, 0], 0.01) for amplitude in (-1.0, 0.0, 1.0)]
+    found = mean_of(runs, np.zeros((4, 0)), shape)
+    size = found.between / (shape[:, 0] ** 2)
+    np.testing.assert_allclose(size, size[0])
+    assert 20 * size[0] == pytest.approx((20 - 0.01) / 3)  # amplitudes of the unit shape: ±√20, 0
+    assert found.p_between < 1e-6 and found.dof == pytest.approx(2.0, rel=0.02)
+    np.testing.assert_allclose(np.diag(found.covariance), found.u**2)
+    assert found.covariance[0, 3] < 0 < found.covariance[0, 1]
+
+
+def test_the_datum_of_a_run_changes_nothing():
+    emap, at = B.error_map, ARTIFACT
+    moved = replace(B, error_map=replace(
+        emap, gx=emap.gx + 1e-5 - 2e-5 * at.y_m + 3e-5 * at.x_m,
+        gy=emap.gy - 2e-5 + 2e-5 * at.x_m + 3e-5 * at.y_m, g_theta=emap.g_theta + 1e-4))
+    plain_one, other = (combine([part("a", A), part("b", b)]) for b in (B, moved))
+    np.testing.assert_allclose(other.xy.values, plain_one.xy.values, atol=1e-17)
+    np.testing.assert_allclose(other.theta.values, plain_one.theta.values, atol=1e-17)
+    np.testing.assert_allclose(other.xy.u, plain_one.xy.u, rtol=1e-6)
+
+
+def test_three_equal_runs_give_their_map_with_a_third_of_the_variance():
+    found = combine([part(name, replace(A, input={})) for name in "abc"]).result
+    np.testing.assert_allclose(found.error_map.gx, A.error_map.gx, atol=1e-18)
+    np.testing.assert_allclose(found.error_map.g_theta, A.error_map.g_theta
+                               - A.error_map.g_theta.mean(), atol=1e-18)
+    np.testing.assert_allclose(found.error_map.u_gy * np.sqrt(3), A.error_map.u_gy, rtol=1e-9)
+    assert found.error_map.nonorthogonality == pytest.approx(A.error_map.nonorthogonality)
+    assert found.error_map.scale_difference == pytest.approx(A.error_map.scale_difference)
+    assert found.verdict.grade is Grade.GOOD
+
+
+def test_the_mean_keeps_its_covariance_in_its_file():
+    found = combine([part("a", A), part("b", B)])
+    read = result_from_dict(plain(result_to_dict(worded(found.result))), "mean")
+    known = found.known.copy()
+    whole, is_full = xy_covariance(read, known)
+    assert is_full
+    np.testing.assert_allclose(whole, found.xy.covariance, atol=1e-6 * whole.max())
+    known[0, 1] = False
+    chosen = np.tile(known.ravel(), 2)
+    np.testing.assert_array_equal(xy_covariance(read, known)[0], whole[np.ix_(chosen, chosen)])
+    angular, is_full = theta_covariance(read, np.ones(ARTIFACT.angular_count, dtype=bool))
+    assert is_full
+    np.testing.assert_allclose(angular, found.theta.covariance, atol=1e-6 * angular.max())
+    a, b = StageMap(read).length_uncertainty()
+    assert 0 < a < 1e-6 and b >= 0
+    damaged = replace(read, extra=read.extra | {"map_covariance": {"xy": [1.0], "scale_xy": 1.0}})
+    with pytest.raises(InputError, match="no covariance of this map"):
+        xy_covariance(damaged, known)
+
+
+def test_an_assumed_microscope_is_shared_by_all_runs():
+    """The variance of its factors in one run is that in the mean of three of its equals."""
+    truth = random_truth(Artifact(5, 0.01), 4, np.random.default_rng(4))
+    result = calibrate(simulate_measurements(
+        truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True),
+        Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")))
+    found = combine([part(name, result) for name in "abc"])
+    factors = np.array(result.extra["covariance_terms"]["factors"])
+    of = np.array(result.extra["covariance_terms"]["terms"]) == "microscope"
+    assert of.any()
+    shared = (factors[of] ** 2).sum(axis=0).ravel() * result.noise.sigma_xy**2
+    np.testing.assert_allclose(found.xy.common, shared, rtol=0.02, atol=1e-3 * shared.max())
+    u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
+    np.testing.assert_allclose(found.xy.within, (u**2 - shared) / 3, rtol=0.02)
+
+
+def test_a_reference_length_is_kept_once():
+    reference = Options(assumed=(), causes=False,
+                        reference=ReferenceLength("artifact", 1e-5, 2e-6, "PTB 1"))
+    runs = [part(name, calibrated(seed, options=reference)) for name, seed in (("a", 1), ("b", 2))]
+    kept, removed = (combine(runs, keep_scale=keep) for keep in (True, False))
+    place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()]) * 2e-6
+    np.testing.assert_allclose(kept.xy.common, place**2, rtol=1e-3, atol=1e-22)
+    assert not removed.xy.common.any()
+    assert removed.result.reference is None
+    assert kept.result.reference["certificate"] == "PTB 1"
+    scale = np.polyfit(ARTIFACT.x_m.ravel(), kept.result.error_map.gx.ravel(), 1)[0]
+    each = [np.polyfit(ARTIFACT.x_m.ravel(), p.error_map.gx.ravel(), 1)[0] for p in runs]
+    assert min(each) < scale < max(each)
+    with pytest.raises(InputError, match="c has no reference length"):
+        combine([*runs, part("c", C)], keep_scale=True)
+
+
+@pytest.mark.parametrize(("kind", "size"), [
+    ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9), ("smooth", 100e-9)])
+def test_coverage_and_false_alarms(kind, size):
+    """95.45 % within U; E_n beyond 1 in 4.55 % of the nodes, and 5 % of runs, without a part.
+
+    The limits are those of 4 standard errors of sets, which scatter by up to 12 %.
+    """
+    sets = [judged((Case(3, kind, size), 5000 + seed)) for seed in range(20)]
+    assert 0.93 < np.mean([one.covered_xy for one in sets]) < 0.995
+    assert np.mean([one.covered_theta for one in sets]) > 0.95
+    runs = 3 * len(sets)
+    disagree = runs * np.mean([one.disagree for one in sets])
+    if kind == "none":
+        assert np.mean([one.beyond for one in sets]) == pytest.approx(0.0455, abs=0.015)
+        assert disagree <= binom.ppf(0.999, runs, 0.05)
+        assert sum(one.between for one in sets) <= binom.ppf(0.999, len(sets), 0.05)
+    else:
+        assert disagree > 0.8 * runs and all(one.between for one in sets)
+    assert sum(one.stands_out for one in sets) <= binom.ppf(0.999, len(sets), 0.05)
+
+
+def test_the_run_that_differs_is_named():
+    runs = [calibrated(seed) for seed in range(10, 14)]
+    emap = runs[2].error_map
+    noise = np.random.default_rng(1).normal(0, 8e-8, (2, *ARTIFACT.shape))
+    off = remove_modes(noise, datum_modes(ARTIFACT, scale=True))
+    runs[2] = replace(runs[2], error_map=replace(emap, gx=emap.gx + off[0], gy=emap.gy + off[1]))
+    found = combine([part(str(i), run) for i, run in enumerate(runs)]).result
+    rows = found.extra["combined"]["runs"]
+    assert [row["stands_out"] for row in rows] == [False, False, True, False]
+    assert not rows[2]["agrees"] and rows[2]["e_n_rms"] > 2 * rows[0]["e_n_rms"]
+    assert found.verdict.grade is Grade.ENLARGED
+    assert found.verdict.enlarged_by[0].name == "between_runs"
+    assert "the 4 runs differ by more than their uncertainties" in worded(found).verdict.sentence
+    u = next(line for line in found.budget if line.component == "between runs")
+    total = np.mean([found.error_map.u_gx**2, found.error_map.u_gy**2])
+    assert 0 < u.effect_rms < np.sqrt(total)
+    parts = [line for line in found.budget if line.quantity == "xy"][:3]
+    assert sum(line.effect_rms**2 for line in parts) == pytest.approx(total)
+
+
+def test_sites_that_a_run_does_not_know_are_unknown():
+    hole = B.error_map.gx.copy()
+    hole[1, 2] = np.nan
+    found = combine([part("a", A), part("b", replace(B, error_map=replace(
+        B.error_map, gx=hole)))]).result
+    assert np.isnan(found.error_map.gx[1, 2]) and np.isnan(found.error_map.u_gx[1, 2])
+    assert np.isnan(found.error_map.gx).sum() == 1
+    assert worded(found).warnings == (
+        "sites that are not known in all runs are unknown in the mean: 1",)
+
+
+@pytest.mark.parametrize(("parts", "message"), [
+    ([part("a", A)], "a single map"),
+    ([Part("a", A.error_map), Part("b", B.error_map)], "no RESULT.json among them"),
+    ([part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
+     "b: its calibration is not qualified"),
+    ([part("a", replace(A, input={"sha256": "1"})), part("b", replace(A, input={"sha256": "1"}))],
+     "b: calibrated from the same bag as a"),
+    ([part("a", A), part("b", calibrated(1, artifact=Artifact(5, 0.01, 12)))],
+     "the lattices differ"),
+    ([part("a", A), part("b", replace(B, error_map=replace(
+        B.error_map, u_gx=np.full(ARTIFACT.shape, np.nan))))], "0 sites are known"),
+])
+def test_what_cannot_be_combined_is_refused(parts, message):
+    with pytest.raises(InputError, match=message):
+        combine(parts)
+
+
+def test_sets_of_runs_differ_by_their_seed_alone():
+    same = [combined(Case(2, "square", 1e-7), seed)[0].xy.values for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(same[0], same[1])
+    assert np.abs(same[0] - same[2]).max() > 1e-8
