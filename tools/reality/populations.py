@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread
@@ -24,7 +26,9 @@ def populations() -> list[Case]:
     return [Case("population clean", draw=_clean),
             Case("population clean, microscope as its default uncertainty says",
                  draw=_microscope),
-            Case("population mixture of twelve effects, half size", draw=_mixture)]
+            Case("population mixture of twelve effects, half size", draw=_mixture),
+            Case("population mixture of twelve effects, half size; model plate_shape:5e-9",
+                 draw=_mixture, options=Options(terms=parse_terms(["plate_shape:5e-9"], "reality")))]
 
 
 def _clean(rng: np.random.Generator, case: Case) -> Case:
