@@ -28,7 +28,12 @@ def populations() -> list[Case]:
                  draw=_microscope),
             Case("population mixture of twelve effects, half size", draw=_mixture),
             Case("population mixture of twelve effects, half size; model plate_shape:5e-9",
-                 draw=_mixture, options=Options(terms=parse_terms(["plate_shape:5e-9"], "reality")))]
+                 draw=_mixture, options=_bent())]
+
+
+def _bent() -> Options:
+    """Return options that declare the bending of a good machine's plate and stage."""
+    return Options(terms=parse_terms(["plate_shape:5e-9"], "reality"))
 
 
 def _clean(rng: np.random.Generator, case: Case) -> Case:
