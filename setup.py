@@ -31,7 +31,7 @@ setup(
     # at least what Ubuntu 24.04 has (`make test-oldest`); what it has not comes from PyPI
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "pyyaml", "mcap>=1.1",
                       "rosbags>=0.10", "matplotlib>=3.6", "rich>=13", "argcomplete>=3",
-                      "threadpoolctl>=3", "lz4", "zstandard"],
+                      "threadpoolctl>=3", "pillow>=10", "lz4", "zstandard"],
     extras_require={"test": ["pytest>=7.4", "hypothesis>=6.98"],  # colcon looks for pytest here
                     "dask": ["distributed>=2024.1"]},
     python_requires=">=3.12",

@@ -4,6 +4,8 @@
 Names are relative: a namespace is put in front.
 """
 
+IMAGE_TOPICS = {"raw": "stage/image", "compressed": "stage/image/compressed"}
+IMAGE_TYPES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
 ENCODER_TOPIC = "stage/joint_states"
 DETECTION_TOPIC = "stage/mark_detections"
 CORRECTED_TOPIC = "stage/corrected_joint_states"

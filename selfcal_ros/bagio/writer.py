@@ -14,14 +14,49 @@ from types import TracebackType
 from typing import Any, Self
 
 import yaml
+from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio.schemas import build, definition_of, hash_of, store_with
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_text
 from selfcal_ros.messages.from_model import Fields
+from selfcal_ros.outputs import temporary_folder
 
 CHUNK_SIZE = 256 * 1024
+UNKNOWN_HASH = "unknown"
+"""Hash of the type of a topic recorded without one."""
+
+
+@contextmanager
+def new_bag(path: str | Path) -> Iterator[Path]:
+    """Yield a folder to write a bag to, renamed to `path` at the end; removed after an error.
+
+    Raises
+    ------
+    InputError
+        If `path` exists, or cannot be created.
+    """
+    target = Path(path)
+    if target.exists():
+        raise InputError(str(target), "exists already", "remove it or name another folder")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_folder(target.parent) as beside:
+            yield Path(beside, target.name)
+            Path(beside, target.name).rename(target)
+    except OSError as error:
+        raise InputError(str(target), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
+
+
+def _profiles(metadata: dict[str, str]) -> list[dict]:
+    """Return the offered QoS profiles in the metadata of a channel; empty if unreadable."""
+    try:
+        found = yaml.safe_load(metadata.get("offered_qos_profiles", "")) or []
+    except yaml.YAMLError:
+        return []
+    return found if isinstance(found, list) else []
 
 
 @contextmanager
@@ -55,18 +90,24 @@ class Closing(ABC):
 class Topic:
     """One topic of a bag: type, offered QoS, and number of messages.
 
-    `heard_on` is the name that it was remapped to; empty = its own.
+    `heard_on` is the name that it was remapped to; empty = its own. `hash` is the hash of its type,
+    which must be known if it is empty.
     """
 
     type: str
     qos: list[dict]
     count: int = 0
     heard_on: str = ""
+    hash: str = ""
+
+    def __post_init__(self) -> None:
+        """Look up the hash of a known type."""
+        self.hash = self.hash or hash_of(self.type)
 
     def channel_metadata(self) -> dict[str, str]:
         """Return the metadata of its channel in rosbag2's format, with `heard_on`."""
         about = {"offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
-                 if self.qos else "", "topic_type_hash": hash_of(self.type)}
+                 if self.qos else "", "topic_type_hash": self.hash}
         return about | ({"heard_on": self.heard_on} if self.heard_on else {})
 
 
@@ -113,7 +154,7 @@ class Metadata:
         topics = [{"topic_metadata": {
             "name": name, "type": topic.type, "serialization_format": "cdr",
             "offered_qos_profiles": topic.qos,
-            "type_description_hash": hash_of(topic.type)},
+            "type_description_hash": topic.hash},
             "message_count": topic.count} for name, topic in self.topics.items()]
         return {
             "version": 9, "storage_identifier": "mcap", "duration": about["duration"],
@@ -191,6 +232,23 @@ class BagWriter(Closing):
         self._metadata.topics[topic] = declared = Topic(typename, qos, heard_on=heard_on)
         self._channels[topic] = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename], declared.channel_metadata())
+
+    def add_copy(self, channel: Channel, schema: Schema | None) -> int:
+        """Declare a channel of another bag, of any type, as it is; return its number here."""
+        name = schema.name if schema else ""
+        number = self._mcap.register_schema(name, schema.encoding, schema.data) if schema else 0
+        about = dict(channel.metadata)
+        self._metadata.topics.setdefault(channel.topic, Topic(
+            name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)))
+        return self._mcap.register_channel(channel.topic, channel.message_encoding, number, about)
+
+    def copy(self, number: int, topic: str, message: Message) -> None:
+        """Write a message of another bag on channel `number`."""
+        self._metadata.topics[topic].count += 1
+        self._entry.add(message.log_time)
+        with writing(self.path):
+            self._mcap.add_message(number, message.log_time, message.data, message.publish_time,
+                                   message.sequence)
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""

@@ -7,6 +7,8 @@
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
@@ -34,6 +36,15 @@ def joint_state(sample: EncoderSample, frame_id: str) -> Fields:
     """Return the fields of a sensor_msgs/JointState."""
     return {"header": header(sample.stamp_ns, frame_id), "name": list(sample.names),
             "position": list(sample.positions), "velocity": list(sample.velocities), "effort": []}
+
+
+def image(values: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Fields:
+    """Return the fields of a sensor_msgs/Image with values of one channel (h, w)."""
+    height, width = values.shape
+    return {"header": header(stamp_ns, frame_id), "height": height, "width": width,
+            "encoding": encoding, "is_bigendian": 0, "step": width * values.itemsize,
+            "data": np.frombuffer(values.astype(values.dtype.newbyteorder("<")).tobytes(),
+                                  np.uint8)}
 
 
 def detection(d: Detection, frame_id: str) -> Fields:

@@ -9,15 +9,15 @@ import numpy as np
 
 from selfcal_ros import topics
 from selfcal_ros.bagio.offline import TRUTH_FILE
-from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Command, Detection
-from selfcal_ros.errors import InputError
 from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.json_form import plain
-from selfcal_ros.outputs import temporary_folder
 from selfcal_ros.simulation.cell import Event
+from selfcal_ros.simulation.exposing import Exposure
 from selfcal_ros.simulation.physics import stage_error
+from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.simulation.spec import Simulation
 from selfcal_ros.simulation.truth import Truth
 
@@ -26,6 +26,9 @@ QOS = {
     topics.DETECTION_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),
     topics.COMMAND_TOPIC: topics.qos_profile(reliable=True, transient_local=True, depth=64),
 }
+IMAGE_TOPIC = topics.IMAGE_TOPICS["raw"]
+IMAGES = 0x1D
+"""Part of the seed of the images."""
 
 
 def write_simulation(simulation: Simulation, path: str | Path, *,
@@ -40,35 +43,40 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
     InputError
         If the folder exists, or cannot be created or written.
     """
-    target = Path(path)
-    if target.exists():
-        raise InputError(str(target), "exists already", "remove it or name another folder")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(target.parent) as beside:
-            counts = _write(simulation, Path(beside, target.name), progress)
-            Path(beside, target.name).rename(target)
-    except OSError as error:
-        raise InputError(str(target), f"cannot be created ({error.strerror})",
-                         "name a writable folder") from error
-    return counts
+    with new_bag(path) as beside:
+        return _write(simulation, beside, progress)
 
 
 def _write(simulation: Simulation, path: Path,
            progress: Callable[[int, int], None]) -> dict[str, int]:
     truth, arrivals, ledger = simulation.run()
+    rng = np.random.default_rng((simulation.seed, simulation.noise_seed or 0, IMAGES))
     with BagWriter(path, simulation.compression) as writer:
         for topic, typename in topics.INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [QOS[topic]])
+        if simulation.camera:
+            writer.add_topic(f"/{IMAGE_TOPIC}", topics.IMAGE_TYPES["raw"],
+                             [QOS[topics.DETECTION_TOPIC]])
         for number, (arrival_ns, event) in enumerate(arrivals):
-            topic, fields = event_fields(event, "stage")
+            if isinstance(event, Exposure):
+                topic, fields = image_fields(event, simulation.camera or Camera(), rng)
+            else:
+                topic, fields = event_fields(event, "stage")
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
         write_truth(path / TRUTH_FILE, truth, seed=simulation.seed,
                     noise_seed=simulation.noise_seed, faults=ledger,
-                    cell=asdict(simulation.settings), spread=asdict(simulation.spread))
+                    cell=asdict(simulation.settings), spread=asdict(simulation.spread),
+                    **({"camera": asdict(simulation.camera)} if simulation.camera else {}))
         return writer.counts
+
+
+def image_fields(exposure: Exposure, camera: Camera, rng: np.random.Generator,
+                 ) -> tuple[str, from_model.Fields]:
+    """Return topic and fields of a rendered image."""
+    values = camera.image(exposure.offsets, rng, angles=exposure.angle)
+    return IMAGE_TOPIC, from_model.image(values, camera.encoding, exposure.stamp_ns, "camera")
 
 
 def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:

@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
+from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
+from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.units import M_PER_UM, NS_PER_S, RAD_PER_MRAD
 
 PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")
@@ -66,8 +69,8 @@ class Faults:
                              "keep the sum at 1 or below: a detection has one fault at most")
 
 
-def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generator,
-                 ) -> tuple[list[tuple[int, Event]], dict[str, int]]:
+def apply_faults(events: Sequence[Event | Exposure], faults: Faults, rng: np.random.Generator,
+                 ) -> tuple[list[tuple[int, Event | Exposure]], dict[str, int]]:
     """Return (time of arrival in ns, message) in the order of arrival, and the ledger.
 
     Parameters
@@ -84,7 +87,7 @@ def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generat
     gap = first + (last - first) // 3
     step_at = first + (last - first) // 2
     step = round(faults.clock_step_s * NS_PER_S)
-    out: list[tuple[int, Event]] = []
+    out: list[tuple[int, Event | Exposure]] = []
     for event in events:
         arrival = event.stamp_ns
         if faults.delay_s:
@@ -102,14 +105,17 @@ def apply_faults(events: Sequence[Event], faults: Faults, rng: np.random.Generat
     return out, dict(ledger)
 
 
-def _spoil(event: Event, faults: Faults, rng: np.random.Generator, ledger: Counter) -> list[Event]:
-    if not isinstance(event, Detection):
+def _spoil(event: Event | Exposure, faults: Faults, rng: np.random.Generator, ledger: Counter,
+           ) -> Sequence[Event | Exposure]:
+    if not isinstance(event, Detection | Exposure):
         return [event]
     chance = rng.random()
     for name in PARTS:
         part = getattr(faults, name)
         if chance < part:
             ledger[name] += 1
+            if isinstance(event, Exposure):  # no others are allowed
+                return [] if name == "lost" else [event, event]
             return _one_fault(event, name, rng)
         chance -= part
     return [event]
@@ -134,7 +140,7 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
                     offset_y=event.offset_y + size * M_PER_UM * np.sin(angle))]
 
 
-UNITS = ("", "_m", "_rad", "_s", "_hz", "_pitches")
+UNITS = ("", "_m", "_rad", "_s", "_hz", "_pitches", "_px", "_deg")
 """Endings of the fields of a dataclass, which the keys of a file do not have."""
 LAST_START_S = 2.1e9
 """Largest start time: stamps are 32 bit seconds, with room for the longest recording."""
@@ -175,6 +181,17 @@ PHYSICS: Section = {name: parameter for name, parameter in _NODE.items()
 FAULTS: Section = _keys(*PARTS) | {
     f"{name}{unit}": Parameter(f"{name}{unit}", 0.0, "", "s", 0.0, 3600.0)
     for unit in ("", "_s") for name in ("delay", "clock_step", "encoder_gap")}
+_DETECTOR: Section = {parameter.name: parameter for parameter in DetectorSettings.parameters()}
+CAMERA: Section = (
+    {name: _DETECTOR[name] for name in (
+        "pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")}
+    | {name: Parameter(name, 0, "", "px", 8, 10_000) for name in ("width", "height")}
+    | _keys("blur", unit="px", high=100.0) | _keys("dirt", high=1000.0)
+    | _keys("ground", "contrast", "read_noise", "shot_noise", "vignetting")
+    | {"distortion": Parameter("distortion", 0.0, "", "", -0.5, 0.5), "encoding": Parameter(
+        "encoding", "mono8", "", choices=("mono8", "mono16"))})
+OF_IMAGES = ("lost", "duplicated")
+"""Faults that images can have."""
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
     Parameter("noise_seed", 0, "of all that a new measurement of the machine changes", low=0,
@@ -189,7 +206,8 @@ class Simulation:
     """A parsed SIM.yaml: plan, seeds, spread of the truth, cell, faults, start time.
 
     `noise_seed` is None if `seed` determines everything; `placed` has the actual poses in
-    views that are not placed as the plan commands.
+    views that are not placed as the plan commands. With a `camera` there are images instead of grid
+    detections.
     """
 
     plan: Plan
@@ -201,8 +219,9 @@ class Simulation:
     compression: str
     noise_seed: int | None = None
     placed: tuple[View | None, ...] = ()
+    camera: Camera | None = None
 
-    def run(self) -> tuple[Truth, list[tuple[int, Event]], dict[str, int]]:
+    def run(self) -> tuple[Truth, list[tuple[int, Event | Exposure]], dict[str, int]]:
         """Return the truth, the messages with their times of arrival, and the counts of faults."""
         machine = rng = np.random.default_rng(self.seed)
         if self.noise_seed is not None:
@@ -210,8 +229,9 @@ class Simulation:
         truth = random_truth(self.plan.artifact, len(self.plan.views), machine, self.spread,
                              placing=rng)
         truth = replace(truth, placed=self.placed)
-        events = list(plan_events(truth, self.plan, settings=self.settings, rng=rng,
-                                  start_ns=self.start_ns))
+        settings = replace(self.settings, with_ids=True) if self.camera else self.settings
+        made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
+        events = list(exposures(truth, self.plan, self.camera, made) if self.camera else made)
         arrivals, ledger = apply_faults(events, self.faults, rng)
         return truth, arrivals, ledger
 
@@ -221,7 +241,8 @@ def read_simulation(path: str | Path) -> Simulation:
 
     Keys: ``plan`` (a path relative to the file, or an inline plan), ``seed``, ``noise_seed``,
     ``truth``, ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of
-    `CellSettings`), ``faults`` (fields of `Faults`), ``start_time`` (s), ``compression``; see
+    `CellSettings`), ``faults`` (fields of `Faults`), ``camera`` (fields of `Camera`),
+    ``start_time`` (s), ``compression``; see
     docs/simulate.md. SI units.
 
     Raises
@@ -232,7 +253,7 @@ def read_simulation(path: str | Path) -> Simulation:
     """
     where = str(path)
     data = _mapping(read_yaml(path), where, (
-        "plan", "truth", "physics", "placed", "noise", "cell", "faults",
+        "plan", "truth", "physics", "placed", "noise", "cell", "faults", "camera",
         *(parameter.name for parameter in TOP)))
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
@@ -242,17 +263,28 @@ def read_simulation(path: str | Path) -> Simulation:
             for name, keys, defaults in (
                 ("truth", TRUTH, Spread()), ("physics", PHYSICS, Spread()),
                 ("noise", NOISE, CellSettings()), ("cell", CELL, CellSettings()),
-                ("faults", FAULTS, Faults()))}
+                ("faults", FAULTS, Faults()), ("camera", CAMERA, Camera()))}
     try:
         settings = CellSettings(**read["noise"], **read["cell"])
         faults = Faults(**read["faults"])
+        camera = Camera(**read["camera"]) if "camera" in data else None
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
+    if camera is not None:
+        _check_of_images(data.get("faults", {}), f"{where}: faults")
     plan = _plan(data["plan"], Path(path))
     return Simulation(plan, top["seed"], Spread(**read["truth"], **read["physics"]), settings,
                       faults, round(top["start_time"] * NS_PER_S), top["compression"],
                       top["noise_seed"] if "noise_seed" in data else None,
-                      _placed(data.get("placed", []), plan, f"{where}: placed"))
+                      _placed(data.get("placed", []), plan, f"{where}: placed"), camera)
+
+
+def _check_of_images(faults: Mapping[str, Any], where: str) -> None:
+    """Refuse faults that images cannot have."""
+    for name in PARTS:
+        if faults.get(name) and name not in OF_IMAGES:
+            raise InputError(f"{where}: {name}", "a fault of detections, but the cell has a camera",
+                             f"use {' and '.join(OF_IMAGES)}, or dirt of the camera")
 
 
 def settings_of(values: Mapping[str, Any]) -> CellSettings:

@@ -154,7 +154,7 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
-     "physics, placed, noise, cell, faults, seed, noise_seed, start_time, compression"),
+     "physics, placed, noise, cell, faults, camera, seed, noise_seed, start_time, compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
@@ -301,3 +301,17 @@ def test_numbers_are_those_of_the_documents(name, keys, defaults):
             assert float(default) == pytest.approx(value, rel=1e-5)
             low, high = map(float, allowed.split(" to "))
             assert (low, high) == (limits.low, limits.high)
+
+
+def test_a_camera_allows_no_faults_of_detections(tmp_path):
+    with pytest.raises(InputError, match="faults: outliers: a fault of detections"):
+        simulation(tmp_path, {"plan": PLAN, "camera": {}, "faults": {"outliers": 0.1}})
+
+
+def test_lost_images_are_counted(tmp_path):
+    _, arrivals, ledger = simulation(tmp_path, {
+        "plan": PLAN, "camera": {}, "faults": {"lost": 0.5}}).run()
+    images = sum(hasattr(event, "offsets") for _, event in arrivals)
+    lines = 2 * 4  # lines stay detections, lost as well
+    detections = sum(hasattr(event, "offset_theta") for _, event in arrivals)
+    assert 0 < images < 50 and images + detections + ledger["lost"] == 50 + lines

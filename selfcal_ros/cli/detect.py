@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal detect``: marks in the images of a bag, written as detections."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.solve import node_settings
+from selfcal_ros.cli.terminal import add_json, say
+
+if TYPE_CHECKING:
+    from selfcal_ros.collection.settings.detector import DetectorSettings
+
+HELP = "find the marks in the images of a bag"
+SHOWN = 5
+"""Number of problems that are printed."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("bag", metavar="BAG", help="bag with stage/image or "
+                        "stage/image/compressed")
+    parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
+                        "create: the detections and all other topics, without the images")
+    add_options(parser)
+    parser.add_argument("--namespace", metavar="NAME", help="namespace of the camera, for bags "
+                        "with several cells; / is the root")
+    add_json(parser)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the parameters of the detector."""
+    parser.add_argument("--pixel-size", type=float, metavar="M", help="side of a pixel on the "
+                        "plate, m")
+    parser.add_argument("--mark", choices=("disc", "ring", "cross", "corner"),
+                        help="kind of mark (default: disc)")
+    parser.add_argument("--mark-size", type=float, metavar="M", help="diameter of a disc or ring, "
+                        "length of the bars of a cross, side of the squares of a corner, m")
+    parser.add_argument("--mark-width", type=float, metavar="M", help="width of the line of a "
+                        "ring or cross, m (default: a fifth of its size)")
+    parser.add_argument("--polarity", choices=("dark", "bright"),
+                        help="marks on their ground (default: dark)")
+    parser.add_argument("--turn", type=float, metavar="DEG", help="angle by which the image is "
+                        "turned to lie along the stage axes, counter-clockwise (default: 0)")
+    parser.add_argument("--mirror", action="store_true", default=None,
+                        help="the image is mirrored: columns run along -x before the turn")
+    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
+                        "of mark_detector is used")
+
+
+def settings_of(args: argparse.Namespace) -> "DetectorSettings":
+    """Return the settings in the arguments."""
+    from selfcal_ros.collection.settings.detector import DetectorSettings
+
+    names = ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
+    return node_settings(args.params, DetectorSettings,
+                         **{name: getattr(args, name) for name in names})
+
+
+def run(args: argparse.Namespace) -> int:
+    """Detect, write the bag and print what was found."""
+    from selfcal_ros.bagio.images import ImageBag
+    from selfcal_ros.bagio.offline import TRUTH_FILE
+    from selfcal_ros.files import read_bytes, write_bytes
+    from selfcal_ros.vision.exposures import ImageDetector
+
+    settings = settings_of(args)
+    detector = ImageDetector(settings, args.params or "options")
+    bag = ImageBag(Path(args.bag), args.namespace)
+    problems = bag.write_detected(args.output, detector.take, settings.frame_id)
+    truth = Path(args.bag, TRUTH_FILE)
+    if truth.is_file():
+        write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
+    for line, count in problems.most_common(SHOWN):
+        print(f"selfcal detect: {args.bag}: {f'{count} x ' if count > 1 else ''}{line}",
+              file=sys.stderr)
+    found = detector.counts.values()
+    say(args, text_of(args.output, found),
+        {"bag": args.output, "counts": found, "problems": dict(problems)})
+    return 0
+
+
+def text_of(output: str, found: dict[str, int]) -> str:
+    """Return the numbers of images and marks as a line."""
+    rejected = ", ".join(f"{count} {name.removeprefix('rejected_')}"
+                         for name, count in found.items() if name.startswith("rejected_"))
+    more = [f"{found[name]} {text}" for name, text in (
+        ("images_without_marks", "images without marks"), ("images_refused", "images refused"))
+        if found[name]]
+    return "; ".join([f"{output}: {found['marks']} marks in {found['images']} images",
+                      *([f"rejected: {rejected}"] if rejected else []), *more])

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposures of a simulated camera instead of detections: all marks of the plate in its field."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.collection.inputs import Command, Detection, Kind
+from selfcal_ros.model.view import Plan
+from selfcal_ros.simulation import physics
+from selfcal_ros.simulation.cell import Event
+from selfcal_ros.simulation.machine import Truth
+from selfcal_ros.simulation.rendering import Camera
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """An image to be rendered.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Its instant.
+    offsets : float array (2, n)
+        Offsets of its marks from the optical axis, stage axes, m.
+    angle : float
+        Direction of the plate's x axis, stage axes, rad.
+    """
+
+    stamp_ns: int
+    offsets: np.ndarray
+    angle: float
+
+
+def exposures(truth: Truth, plan: Plan, camera: Camera,
+              events: Iterable[Event]) -> Iterator[Event | Exposure]:
+    """Yield `events` with an exposure instead of each grid detection, which names its mark.
+
+    The detected mark is at its offset; the others lie around it as on the plate, seen through the
+    same microscope.
+    """
+    (hx, hy), reach = truth.artifact.half, camera.reach_m
+    m, n = (side.ravel() for side in np.mgrid[-hx:hx + 1, -hy:hy + 1])
+    place, index, angle = np.zeros((2, 0)), -1, 0.0
+    for event in events:
+        if isinstance(event, Command) and event.view is not None and event.view_index != index:
+            index = event.view_index
+            view = truth.placed_as(index, event.view)
+            place, _ = physics.mark_places(truth, index, view, (m, n))
+            angle = float(view.rotation_rad + truth.phi_rad[index])
+        if isinstance(event, Detection) and event.kind == Kind.GRID:
+            own = place[:, (event.m + hx) * (2 * hy + 1) + event.n + hy]
+            away = place - own[:, None]
+            near = np.hypot(*away) < reach
+            offset = np.array([[event.offset_x], [event.offset_y]])
+            yield Exposure(event.stamp_ns, offset + physics.seen_offset(truth, away[:, near]),
+                           angle)
+        else:
+            yield event

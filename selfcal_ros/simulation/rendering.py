@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images of a simulated camera: shapes of marks, blur, pixels, illumination, noise, dirt.
+
+Shapes are drawn on a grid several times finer than the pixels, blurred there and averaged over
+each pixel; the detector's models are not used.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+
+FINE = 8
+"""Points of the fine grid along a pixel."""
+DIRT_RADIUS = (0.05, 0.2)
+"""Range of the radius of dirt, in sizes of a mark."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera and the marks in its images; grey values over the full scale, 0 to 1.
+
+    Attributes
+    ----------
+    width, height : int
+        Size of the image, px.
+    pixel_size_m : float
+        Side of a pixel on the plate.
+    mark : str
+        ``disc``, ``ring``, ``cross`` or ``corner``.
+    mark_size_m, mark_width_m : float
+        As the parameters of mark_detector.
+    polarity : str
+        ``dark`` or ``bright``.
+    turn_deg, mirror
+        As the parameters of mark_detector.
+    blur_px : float
+        Standard deviation of the point spread.
+    ground, contrast : float
+        Grey value of the ground, and its absolute difference to the marks.
+    read_noise, shot_noise : float
+        Standard deviation of dark pixels, and that added by light at full scale.
+    vignetting : float
+        Relative loss of light in the corners of the image.
+    distortion : float
+        Relative radial displacement of marks in the corners.
+    dirt : float
+        Mean number of specks per image.
+    encoding : str
+        ``mono8`` or ``mono16``.
+
+    Raises
+    ------
+    InputError
+        For an empty image, or sizes that are not positive.
+    """
+
+    width: int = 96
+    height: int = 96
+    pixel_size_m: float = 2e-6
+    mark: str = "disc"
+    mark_size_m: float = 50e-6
+    mark_width_m: float = 10e-6
+    polarity: str = "dark"
+    turn_deg: float = 0.0
+    mirror: bool = False
+    blur_px: float = 1.0
+    ground: float = 0.8
+    contrast: float = 0.6
+    read_noise: float = 0.005
+    shot_noise: float = 0.01
+    vignetting: float = 0.0
+    distortion: float = 0.0
+    dirt: float = 0.0
+    encoding: str = "mono8"
+
+    def __post_init__(self) -> None:
+        """Refuse impossible sizes."""
+        if min(self.pixel_size_m, self.mark_size_m, self.mark_width_m) <= 0:
+            raise InputError("camera", "a size is 0", "give pixel_size, mark_size and mark_width")
+
+    @property
+    def full_scale(self) -> int:
+        """Largest grey value."""
+        return 65535 if self.encoding == "mono16" else 255
+
+    @property
+    def reach_m(self) -> float:
+        """Distance from the axis beyond which no mark touches the image, twice over."""
+        side = np.hypot(self.width, self.height) * self.pixel_size_m
+        return float(side + 2 * self.mark_size_m)
+
+    def pixels_of(self, offsets: np.ndarray) -> np.ndarray:
+        """Return column and row (2, n) of points at offsets (2, n) from the optical axis, m."""
+        turn = np.deg2rad(self.turn_deg)
+        back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        right, up = back @ offsets / self.pixel_size_m
+        if self.mirror:
+            right = -right
+        centre = np.array([[(self.width - 1) / 2], [(self.height - 1) / 2]])
+        out = np.stack([right, -up])
+        return centre + out * (1 + self.distortion * np.square(out).sum(axis=0)
+                               / np.square(centre).sum())
+
+    def image(self, offsets: np.ndarray, rng: np.random.Generator, *,
+              angles: Sequence[float] | float = 0.0) -> np.ndarray:
+        """Return an image (height, width) of marks at `offsets` (2, n), m, with noise and dirt.
+
+        Parameters
+        ----------
+        offsets : float array (2, n)
+            Of the marks from the optical axis, stage axes.
+        rng
+            Source of noise and dirt.
+        angles : float or (n,)
+            Directions of their first bars or edges, stage axes, rad.
+        """
+        sign = 1 if self.polarity == "bright" else -1
+        grey = np.full((self.height, self.width), self.ground)
+        size = self.mark_size_m / self.pixel_size_m
+        for (u, v), angle in zip(self.pixels_of(offsets).T, np.broadcast_to(
+                angles, offsets.shape[1]), strict=True):
+            self._add(grey, u, v, size, self._pixel_angle(float(angle)), sign * self.contrast)
+        for _ in range(rng.poisson(self.dirt) if self.dirt else 0):
+            u, v = rng.uniform(0, self.width), rng.uniform(0, self.height)
+            self._speck(grey, u, v, 2 * size * rng.uniform(*DIRT_RADIUS))
+        light = np.clip(grey, 0.0, None) * self._lighting()
+        spread = np.sqrt(self.read_noise ** 2 + self.shot_noise ** 2 * light)
+        value = (light + spread * rng.normal(size=light.shape)) * self.full_scale
+        return np.clip(np.rint(value), 0, self.full_scale).astype(
+            np.uint16 if self.encoding == "mono16" else np.uint8)
+
+    def _pixel_angle(self, angle: float) -> float:
+        """Return a direction in stage axes as an angle from columns to rows."""
+        turned = angle - np.deg2rad(self.turn_deg)
+        return np.pi + turned if self.mirror else -turned
+
+    def _lighting(self) -> np.ndarray:
+        v, u = np.mgrid[0:self.height, 0:self.width]
+        right, down = u - (self.width - 1) / 2, v - (self.height - 1) / 2
+        return 1 - self.vignetting * (right ** 2 + down ** 2) / (
+            right[0, 0] ** 2 + down[0, 0] ** 2)
+
+    def _add(self, grey: np.ndarray, u: float, v: float, size: float, angle: float,
+             contrast: float) -> None:
+        """Add a blurred mark at column `u` and row `v`."""
+        half = int(np.ceil((1.5 if self.mark == "corner" else 0.75) * size + 4 * self.blur_px)) + 2
+        width = self.mark_width_m / self.pixel_size_m
+        self._stamp(grey, u, v, half, lambda a, b: distance(self.mark, a, b, size, width),
+                    contrast, angle)
+
+    def _speck(self, grey: np.ndarray, u: float, v: float, size: float) -> None:
+        self._stamp(grey, u, v, int(np.ceil(size + 4 * self.blur_px)) + 2,
+                    lambda a, b: distance("disc", a, b, size, 0.0), -0.9 * self.ground, 0.0)
+
+    def _stamp(self, grey: np.ndarray, u: float, v: float, half: int, inside: "Distance",
+               contrast: float, angle: float) -> None:
+        from scipy import ndimage  # half a second, which stage_simulator saves
+
+        column, row = round(u), round(v)
+        step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
+        b, a = np.meshgrid(step - (v - row), step - (u - column), indexing="ij")
+        cosine, sine = np.cos(angle), np.sin(angle)
+        cover = np.clip(0.5 + FINE * inside(cosine * a + sine * b, cosine * b - sine * a), 0, 1)
+        cover = ndimage.gaussian_filter(cover, self.blur_px * FINE, truncate=5.0, mode="nearest")
+        pixels = cover.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean(axis=(1, 3))
+        top, left = row - half, column - half
+        rows = slice(max(top, 0), max(min(top + 2 * half + 1, self.height), 0))
+        columns = slice(max(left, 0), max(min(left + 2 * half + 1, self.width), 0))
+        grey[rows, columns] += contrast * pixels[
+            rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
+
+
+Distance = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Distance of points to the edge of a shape, positive inside, px."""
+
+
+def _box(a: np.ndarray, b: np.ndarray, length: float, width: float) -> np.ndarray:
+    return np.minimum(length / 2 - np.abs(a), width / 2 - np.abs(b))
+
+
+def distance(mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float) -> np.ndarray:
+    """Return the distance of points to the edge of a mark, positive inside, px.
+
+    A corner is where two squares of side `size` meet.
+    """
+    if mark == "disc":
+        return size / 2 - np.hypot(a, b)
+    if mark == "ring":
+        return width / 2 - np.abs(np.hypot(a, b) - (size - width) / 2)
+    if mark == "cross":
+        return np.maximum(_box(a, b, size, width), _box(a, b, width, size))
+    return np.maximum(_box(a - size / 2, b - size / 2, size, size),
+                      _box(a + size / 2, b + size / 2, size, size))

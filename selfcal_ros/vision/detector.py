@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mark detections of images: candidates, fits, reasons of rejection, offsets in stage axes."""
+
+from collections import Counter
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from selfcal_ros.collection.inputs import Detection, Kind
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.vision.finding import Candidate, candidates
+from selfcal_ros.vision.fitting import Fit, fitted, window_of
+from selfcal_ros.vision.images import Picture
+from selfcal_ros.vision.models import MODELS
+
+SMALLEST_SIZE, LARGEST_SIZE = 6.0, 2000.0
+"""Range of the size of a mark, px."""
+WIDTH = 0.2
+"""Default width of lines over the size of the mark."""
+STAINED = 3
+"""Number of stained pixels from which a mark is rejected."""
+SATURATED = 0.01
+"""Part of saturated pixels from which a mark is rejected."""
+SAME = 0.3
+"""Distance of two fits, in sizes of the mark, below which they are of the same mark."""
+FIRST_BLUR = 0.05
+"""First blur of a fit, in sizes of the mark; at least a pixel."""
+
+
+class Fault(StrEnum):
+    """Why a possible mark is rejected."""
+
+    CUT_OFF = "cut_off"
+    SATURATED = "saturated"
+    NO_FIT = "no_fit"
+    DEFOCUSED = "defocused"
+    WRONG_SIZE = "wrong_size"
+    REFLECTION = "reflection"
+    DIRT = "dirt"
+    BROKEN = "broken"
+    WEAK = "weak"
+    DOUBLE = "double"
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A mark in an image.
+
+    Attributes
+    ----------
+    u, v : float
+        Column and row of its centre; 0 is the centre of the first pixel.
+    u_u, u_v : float
+        Their standard uncertainties, px.
+    score : float
+        Part of the variance of its window that the model explains, 0 to 1.
+    fit : Fit
+        The fit.
+    """
+
+    u: float
+    v: float
+    u_u: float
+    u_v: float
+    score: float
+    fit: Fit
+
+
+class MarkDetector:
+    """Find the marks of images.
+
+    Parameters
+    ----------
+    settings : DetectorSettings
+        Values of the parameters of mark_detector.
+    where : str
+        Place of these for errors.
+
+    Raises
+    ------
+    InputError
+        If the size of the pixels or marks is not set, or marks are too small or large in pixels.
+    """
+
+    def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
+        for name in ("pixel_size", "mark_size"):
+            if not getattr(settings, name) > 0:
+                raise InputError(f"{where}: {name}", "is not set", "give it in m; `selfcal camera "
+                                 "init` finds the size of a pixel")
+        self.settings, self._model = settings, MODELS[settings.mark]
+        self.size = settings.mark_size / settings.pixel_size
+        self._width = settings.mark_width / settings.pixel_size or WIDTH * self.size
+        if not SMALLEST_SIZE <= self.size <= LARGEST_SIZE:
+            raise InputError(f"{where}: mark_size", f"{self.size:.3g} pixels",
+                             f"a mark has {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} pixels; correct "
+                             "mark_size or pixel_size")
+        if 2 * self._width >= self.size and settings.mark in ("ring", "cross"):
+            raise InputError(f"{where}: mark_width", "at least half of mark_size",
+                             "give the width of one line")
+        self._sign = 0 if settings.mark == "corner" else 1 if settings.polarity == "bright" else -1
+
+    def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
+        """Return the marks of an image, row by row, and the number of rejected ones by reason."""
+        image, full = picture.values, self.settings.full_scale or picture.full_scale
+        found: list[Mark] = []
+        faults: Counter[str] = Counter()
+        for candidate in candidates(image, mark=self.settings.mark, size=self.size,
+                                    width=self._width, sign=self._sign):
+            mark = self._mark(image, candidate, full)
+            if isinstance(mark, Mark) and any(
+                    np.hypot(mark.u - other.u, mark.v - other.v) < SAME * self.size
+                    for other in found):
+                mark = Fault.DOUBLE
+            if isinstance(mark, Mark):
+                found.append(mark)
+            else:
+                faults[str(mark)] += 1
+        return found, faults
+
+    def _mark(self, image: np.ndarray, candidate: Candidate, full: int) -> Mark | Fault:
+        radius = self._model.reach * self.size + 2
+        start = self._model.start(self.size, self._width, candidate.angle,
+                                  max(1.0, FIRST_BLUR * self.size))
+        column, row = candidate.column, candidate.row
+        while True:
+            window = window_of(image, column, row, radius)
+            if window is None:
+                return Fault.CUT_OFF
+            if (window.value >= full).mean() > SATURATED:
+                return Fault.SATURATED
+            fit = fitted(self._model, window, start)
+            if fit is None:
+                return Fault.NO_FIT
+            du, dv = (round(float(away)) for away in fit.centre)
+            if not (du or dv) or (column, row) != (candidate.column, candidate.row):
+                break  # centred on a first fit, so that nothing depends on the candidate
+            column, row = column + du, row + dv
+            start = np.array(list(fit.shape.values()))
+        fault = self._fault(fit)
+        if fault is not None:
+            return fault
+        u_u, u_v = np.sqrt(np.diagonal(fit.covariance)).tolist()
+        return Mark(column + float(fit.centre[0]), row + float(fit.centre[1]), u_u, u_v,
+                    min(max(fit.explained, 0.0), 1.0), fit)
+
+    def _fault(self, fit: Fit) -> Fault | None:
+        """Return why a fitted mark is rejected, or None."""
+        given = self.settings
+        size = fit.shape.get("size", self.size)
+        if self._sign * fit.contrast < 0:
+            return Fault.NO_FIT
+        if abs(fit.shape["blur"]) > given.max_blur * self.size:
+            return Fault.DEFOCUSED
+        if fit.bright + fit.dark + fit.inner_stains + fit.outer_stains >= STAINED:
+            if max(fit.bright, fit.dark) >= STAINED:  # these spoil the levels of the others
+                return Fault.REFLECTION if fit.bright > fit.dark else Fault.DIRT
+            return Fault.BROKEN if fit.inner_stains > fit.outer_stains else Fault.DIRT
+        if abs(size / self.size - 1) > given.size_tolerance:
+            return Fault.WRONG_SIZE
+        if not np.sqrt(np.diagonal(fit.covariance)).max() <= given.max_sigma_px:
+            return Fault.WEAK
+        return None
+
+    def detections(self, picture: Picture, stamp_ns: int,
+                   ) -> tuple[list[Detection], Counter[str]]:
+        """Return the detections of an image, and the number of rejected marks by reason."""
+        marks, faults = self.marks(picture)
+        out = []
+        for mark in marks:
+            x, y = offset(mark.u, mark.v, picture.values.shape, self.settings)
+            sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2))
+            out.append(Detection(stamp_ns, int(Kind.GRID), False, 0, 0, 0, x, y, 0.0, sigma,
+                                 mark.score))
+        return out, faults
+
+
+def offset(u: float, v: float, shape: tuple[int, ...], settings: DetectorSettings,
+           ) -> tuple[float, float]:
+    """Return the offset of a place in the image from the optical axis, stage axes, m.
+
+    The axis is the centre of the image; rows run along -y before the turn.
+    """
+    right, up = u - (shape[1] - 1) / 2, (shape[0] - 1) / 2 - v
+    if settings.mirror:
+        right = -right
+    turn = np.deg2rad(settings.turn)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return (float(cosine * right - sine * up) * settings.pixel_size,
+            float(sine * right + cosine * up) * settings.pixel_size)

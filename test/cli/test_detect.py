@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal detect``: images to a map within its uncertainty of the truth; bad images."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from PIL import Image
+
+from selfcal_ros.bagio.images import ImageBag
+from selfcal_ros.bagio.schemas import build, store_with
+from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.cli.main import main
+from selfcal_ros.files import read_json
+from selfcal_ros.messages import from_model
+from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS, IMAGE_TYPES
+
+SIM = """
+plan:
+  plan_id: camera
+  artifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 0}
+  views:
+    - {name: identity, repeats: 2}
+    - {name: rot90, rotation_deg: 90, repeats: 2}
+    - {name: shift, translation_pitch: [1, 0], repeats: 2}
+seed: 4
+truth: {t: 1.0e-5, phi: 1.0e-4}
+noise: {sigma_xy: 2.0e-8}
+camera: {width: 72, height: 64, pixel_size: 3.0e-6, mark_size: 60.0e-6, turn: 30.0, mirror: true,
+  blur: 0.9, read_noise: 0.004, shot_noise: 0.006, vignetting: 0.1}
+"""
+OPTIONS = ["--pixel-size", "3e-6", "--mark-size", "60e-6", "--turn", "30", "--mirror"]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    (folder / "sim.yaml").write_text(SIM)
+    assert main(["simulate", str(folder / "sim.yaml"), "-o", str(folder / "bag")]) == 0
+    return folder / "bag"
+
+
+def items(bag):
+    return list(ImageBag(bag).items())
+
+
+def contents(folder, topic):
+    """Return log time and bytes of the messages of a topic, by the library's own reader."""
+    with next(Path(folder).glob("*.mcap")).open("rb") as file:
+        return [(message.log_time, message.data) for _, channel, message in
+                make_reader(file).iter_messages() if channel.topic == topic]
+
+
+def detect(bag, output, *more):
+    return main(["detect", str(bag), "-o", str(output), *OPTIONS, *more])
+
+
+def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys):
+    assert detect(bag, tmp_path / "found", "--json") == 0
+    counts = json.loads(capsys.readouterr().out)["counts"]
+    assert counts == {"images": 140, "images_refused": 0, "images_without_marks": 0, "marks": 140}
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    result, truth = read_json(tmp_path / "R.json"), read_json(bag / "truth.json")
+    emap = result["error_map"]
+    for axis in ("gx", "gy"):
+        away = np.array(emap[axis], float) - truth[axis]
+        assert (np.abs(away) < 5 * np.array(emap[f"u_{axis}"], float)).all()
+        assert np.abs(truth[axis]).max() > 10 * np.abs(away).max()
+
+
+@pytest.mark.parametrize("wrong", [["--turn", "210"], ["--turn", "120"]])
+def test_a_camera_that_is_turned_otherwise_is_noticed(bag, tmp_path, wrong):
+    assert detect(bag, tmp_path / "found", *wrong) == 0
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (2, 5)
+
+
+def test_other_topics_are_unchanged_and_images_left_out(bag, tmp_path):
+    assert detect(bag, tmp_path / "found") == 0
+    for topic in (f"/{ENCODER_TOPIC}", "/selfcal/view_command"):
+        assert contents(tmp_path / "found", topic) == contents(bag, topic) != []
+    images = contents(bag, "/stage/image")
+    found = contents(tmp_path / "found", f"/{DETECTION_TOPIC}")
+    assert [stamp for stamp, _ in found] == [stamp for stamp, _ in images]
+    assert contents(tmp_path / "found", "/stage/image") == []
+    assert (tmp_path / "found" / "truth.json").read_bytes() == (bag / "truth.json").read_bytes()
+
+
+def rewritten(bag, target, change, space=""):
+    """Write a bag with the first 20 images, each as `change` (number, message) gives them."""
+    transport = "compressed" if change is compressed else "raw"
+    topic, kind = f"/{space}{IMAGE_TOPICS[transport]}", IMAGE_TYPES[transport]
+    images = [item for item in items(bag) if item.is_image][:20]
+    with BagWriter(target) as writer:
+        writer.add_topic(topic, kind, [])
+        for number, item in enumerate(images):
+            data = change(number, item.image)
+            writer.write_raw(topic, data, item.message.log_time)
+
+
+def bytes_of(message, kind=IMAGE_TYPES["raw"]):
+    return bytes(store_with(kind).serialize_cdr(message, kind))
+
+
+def unchanged(number, message):
+    return bytes_of(message)
+
+
+def compressed(number, message):
+    file = io.BytesIO()
+    Image.fromarray(message.data.reshape(message.height, message.width)).save(file, "PNG")
+    kind = store_with(IMAGE_TYPES["compressed"]).types[IMAGE_TYPES["compressed"]]
+    return bytes_of(kind(message.header, "mono8; png compressed mono8", np.frombuffer(
+        file.getvalue(), np.uint8)), IMAGE_TYPES["compressed"])
+
+
+def test_compressed_images_give_the_same(bag, tmp_path):
+    for name, change in (("raw", unchanged), ("compressed", compressed)):
+        rewritten(bag, tmp_path / name, change, "cell1/")
+        assert detect(tmp_path / name, tmp_path / f"found_{name}") == 0
+    found = [contents(tmp_path / f"found_{name}", f"/cell1/{DETECTION_TOPIC}")
+             for name in ("raw", "compressed")]
+    assert found[0] == found[1] and len(found[0]) == 20
+
+
+def spoilt(number, message):
+    if number == 3:
+        message.encoding = "yuv422"
+    if number == 5:
+        message.height -= 1
+    if number == 7:
+        message.data = message.data[:100]
+    if number == 9:
+        return b"\0\1\0\0garbage"
+    if number == 11:
+        message.header.stamp.sec -= 10
+    if number == 13:
+        message.data = np.full_like(message.data, 200)
+    return bytes_of(message)
+
+
+def test_bad_images_give_one_line_each_and_lose_nothing_else(bag, tmp_path, capsys):
+    rewritten(bag, tmp_path / "bad", spoilt)
+    assert detect(tmp_path / "bad", tmp_path / "found") == 0
+    printed = capsys.readouterr()
+    assert printed.out.strip().endswith(
+        "14 marks in 15 images; 1 images without marks; 4 images refused")
+    lines = printed.err.splitlines()
+    assert len(lines) == 5
+    for text in ("encoding 'yuv422'", "72 x 63 pixels, but the first image has 72 x 64",
+                 "100 bytes in rows of 72", "messages on /stage/image could not be decoded",
+                 "its stamp is not later"):
+        assert sum(text in line for line in lines) == 1
+    assert len(contents(tmp_path / "found", f"/{DETECTION_TOPIC}")) == 14
+
+
+@pytest.mark.parametrize("arguments, code, line", [
+    (["--pixel-size", "0"], 2, "pixel_size: is not set; give it in m"),
+    (["--mark-size", "2e-6"], 2, "mark_size: 0.667 pixels; a mark has 6 to 2000 pixels"),
+    (["--namespace", "other"], 4, "no topic stage/image or stage/image/compressed")])
+def test_impossible_requests_end_with_one_line(bag, tmp_path, capsys, arguments, code, line):
+    assert detect(bag, tmp_path / "found", *arguments) == code
+    [printed] = capsys.readouterr().err.splitlines()
+    assert line in printed
+    assert not (tmp_path / "found").exists()
+
+
+def test_topics_of_foreign_types_are_kept(bag, tmp_path):
+    with (tmp_path / "foreign.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("odd_msgs/msg/Odd", "ros2msg", b"float64 x")
+        odd = writer.register_channel("/odd", "cdr", schema, {"offered_qos_profiles": ": : ["})
+        text = store_with(IMAGE_TYPES["raw"]).generate_msgdef(IMAGE_TYPES["raw"], ros_version=2)[0]
+        image = writer.register_channel("/stage/image", "cdr", writer.register_schema(
+            IMAGE_TYPES["raw"], "ros2msg", text.encode()))
+        fields = from_model.image(np.full((64, 72), 200, np.uint8), "mono8", 5, "camera")
+        stamp = store_with(IMAGE_TYPES["raw"])
+        data = bytes_of(build(stamp, IMAGE_TYPES["raw"], fields))
+        writer.add_message(image, 7, data, 7)
+        writer.add_message(odd, 8, b"\0\1\0\0" + bytes(8), 6, 3)
+        writer.finish()
+    assert detect(tmp_path / "foreign.mcap", tmp_path / "found") == 0
+    assert contents(tmp_path / "found", "/odd") == [(8, b"\0\1\0\0" + bytes(8))]
+    assert "/odd" in (tmp_path / "found" / "metadata.yaml").read_text()
