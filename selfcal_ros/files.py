@@ -18,7 +18,7 @@ from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
-from selfcal_ros.errors import InputError, first_line
+from selfcal_ros.errors import InputError, first_line, known_are
 from selfcal_ros.outputs import atomic_file
 
 MAX_YAML_BYTES = 4 << 20
@@ -327,3 +327,43 @@ def add_file(digest: Any, path: Path) -> None:
     except OSError as error:
         raise InputError(str(path), f"cannot be read ({_reason(error)})",
                          "name a readable file") from error
+
+
+def checked_fields(data: object, where: str, required: dict,
+                   optional: dict | None = None) -> dict:
+    """Return the fields of a mapping with their types checked and defaults filled in.
+
+    Parameters
+    ----------
+    data : object
+        Parsed YAML.
+    where : str
+        File and place, for messages.
+    required, optional : dict
+        Key -> type; key -> type and default.
+
+    Raises
+    ------
+    InputError
+        For a missing or unknown key, or a value of another type.
+    """
+    if not isinstance(data, dict):
+        raise InputError(where, "not a mapping of keys to values", "see config/plans for examples")
+    optional = optional or {}
+    for key in data:
+        if key not in required and key not in optional:
+            raise InputError(f"{where}: {key}", "unknown key",
+                             known_are(str(key), [*required, *optional]))
+    out = {key: default for key, (_, default) in optional.items()}
+    for key in required:
+        if key not in data:
+            raise InputError(where, f"the key '{key}' is missing", "add it")
+    for key, value in data.items():
+        kind = required[key] if key in required else optional[key][0]
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
+                             "correct the value")
+        out[key] = value
+    return out

@@ -6,7 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import (
     Artifact,
     Interpolation,
@@ -215,12 +216,13 @@ def plan_from_dict(data: object, where: str) -> Plan:
         For a missing or unknown key, a wrong type, an unknown visiting order or term, or an
         impossible pose.
     """
-    fields = _fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
-                     {"visit_order": (str, ""), "model_terms": (list, []),
-                      "check_stops": (dict, {}), "microscope": (dict, {}), "map": (dict, {})})
-    raw = _fields(fields["artifact"], f"{where}: artifact",
-                  {"grid_size": int, "grid_pitch": float, "angular_count": int},
-                  {"grid_size_y": (int, 0)})
+    fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
+                            {"visit_order": (str, ""), "model_terms": (list, []),
+                             "check_stops": (dict, {}), "microscope": (dict, {}),
+                             "map": (dict, {})})
+    raw = checked_fields(fields["artifact"], f"{where}: artifact",
+                         {"grid_size": int, "grid_pitch": float, "angular_count": int},
+                         {"grid_size_y": (int, 0)})
     artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
                         raw["grid_size_y"])
     order = _order(fields["visit_order"], where)
@@ -252,7 +254,7 @@ def _map_grid(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
     """Return the nodes of the map; None if the plan does not give them."""
     if not data:
         return None
-    raw = _fields(data, where, {"grid_size": int}, {
+    raw = checked_fields(data, where, {"grid_size": int}, {
         "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
         "grid_size_y": (int, 0)})
     if raw["interpolation"] not in list(Interpolation):
@@ -268,7 +270,7 @@ def _with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str
     """Return the terms, including the microscope's from the plan."""
     if not raw:
         return terms
-    fields = _fields(raw, where, {}, {
+    fields = checked_fields(raw, where, {}, {
         "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
     if any(term.startswith(TermName.MICROSCOPE) for term in terms):
         raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
@@ -291,7 +293,7 @@ def _checks(data: dict, where: str) -> tuple[int, float]:
     if isinstance(data.get("offset"), str):  # YAML reads 20e-6, without a point, as a string
         with suppress(ValueError):  # refused below
             data = data | {"offset": float(data["offset"])}
-    raw = _fields(data, where, {"marks": int, "offset": float})
+    raw = checked_fields(data, where, {"marks": int, "offset": float})
     return raw["marks"], raw["offset"]
 
 
@@ -313,10 +315,10 @@ def _order(text: str, where: str) -> str:
 
 
 def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) -> View:
-    raw = _fields(data, where, {"name": str},
-                  {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
-                   "translation_mm": (list, None), "grid": (bool, True), "angular": (bool, None),
-                   "repeats": (int, 1), "visit_order": (str, order)})
+    raw = checked_fields(data, where, {"name": str},
+                         {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
+                          "translation_mm": (list, None), "grid": (bool, True),
+                          "angular": (bool, None), "repeats": (int, 1), "visit_order": (str, order)})
     a, b = _translation_m(raw, where, artifact)
     if raw["repeats"] < 1:
         raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
@@ -371,26 +373,3 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})}
 
-
-def _fields(data: object, where: str, required: dict, optional: dict | None = None) -> dict:
-    """Return the fields of a mapping with their types checked and defaults filled in."""
-    if not isinstance(data, dict):
-        raise InputError(where, "not a mapping of keys to values", "see config/plans for examples")
-    optional = optional or {}
-    for key in data:
-        if key not in required and key not in optional:
-            raise InputError(f"{where}: {key}", "unknown key",
-                             known_are(str(key), [*required, *optional]))
-    out = {key: default for key, (_, default) in optional.items()}
-    for key in required:
-        if key not in data:
-            raise InputError(where, f"the key '{key}' is missing", "add it")
-    for key, value in data.items():
-        kind = required[key] if key in required else optional[key][0]
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
-                             "correct the value")
-        out[key] = value
-    return out
