@@ -318,7 +318,8 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
     raw = checked_fields(data, where, {"name": str},
                          {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
                           "translation_mm": (list, None), "grid": (bool, True),
-                          "angular": (bool, None), "repeats": (int, 1), "visit_order": (str, order)})
+                          "angular": (bool, None), "repeats": (int, 1),
+                          "visit_order": (str, order)})
     a, b = _translation_m(raw, where, artifact)
     if raw["repeats"] < 1:
         raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
