@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import checked_fields
 
 MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
@@ -184,3 +185,19 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
     sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.half]
     return MapGrid(sides[0], pitch_m, Interpolation.BICUBIC,
                    sides[1] if sides[1] != sides[0] else 0)
+
+
+def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
+    """Return the nodes of the map; None if the plan does not give them."""
+    if not data:
+        return None
+    raw = checked_fields(data, where, {"grid_size": int}, {
+        "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
+        "grid_size_y": (int, 0)})
+    if raw["interpolation"] not in list(Interpolation):
+        raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
+                         f"use one of {', '.join(Interpolation)}")
+    sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
+    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.half, sizes, strict=True))
+    return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
+                   Interpolation(raw["interpolation"]), raw["grid_size_y"])

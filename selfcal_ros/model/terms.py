@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.files import checked_fields
 
 MAX_DRIFT_DEGREE = 9
 """Largest degree of the polynomial of a view's drift."""
@@ -202,3 +203,24 @@ def _size(text: str, where: str) -> float:
         raise InputError(where, f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
                          "give a standard deviation in SI units, as in plate_shape:30e-9")
     return size
+
+
+def with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str, ...]:
+    """Return the terms, including the microscope's from the plan."""
+    if not raw:
+        return terms
+    fields = checked_fields(raw, where, {}, {
+        "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
+    if any(term.startswith(TermName.MICROSCOPE) for term in terms):
+        raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
+    sizes = ":".join(f"{size:g}" for size in fields.values())
+    return tuple(map(str, parse_terms([*terms, f"{TermName.MICROSCOPE}:{sizes}"], where)))
+
+
+def terms_of(texts: list, where: str) -> tuple[str, ...]:
+    """Return the terms in PLAN.yaml as texts in their usual form."""
+    where = f"{where}: model_terms"
+    for text in texts:
+        if not isinstance(text, str):
+            raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
+    return tuple(str(term) for term in parse_terms(texts, where))

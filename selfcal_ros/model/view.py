@@ -10,9 +10,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import (
     Artifact,
-    Interpolation,
-    MapGrid,
     default_map_grid,
+    map_grid_of,
     map_grid_to_dict,
 )
 from selfcal_ros.model.orders import parse_order
@@ -25,7 +24,7 @@ from selfcal_ros.model.pose import (
     nearest_step,
     whole_steps,
 )
-from selfcal_ros.model.terms import TermName, parse_terms
+from selfcal_ros.model.terms import terms_of, with_microscope
 from selfcal_ros.units import MM_PER_M
 
 MAX_VIEWS = 1000
@@ -232,7 +231,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     checks = _checks(fields["check_stops"], f"{where}: check_stops")
     views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
                   for index, view in enumerate(fields["views"]))
-    grid = _map_grid(fields["map"], artifact, f"{where}: map")
+    grid = map_grid_of(fields["map"], artifact, f"{where}: map")
     if grid is None and not all(view.is_on_lattice(artifact) for view in views):
         grid = default_map_grid(artifact)
     artifact = replace(artifact, map_grid=grid)
@@ -245,45 +244,9 @@ def plan_from_dict(data: object, where: str) -> Plan:
             raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
                              "give every view its own name")
         names.add(view.name)
-    terms = _terms(fields["model_terms"], where)
-    return Plan(fields["plan_id"], artifact, views, _with_microscope(
+    terms = terms_of(fields["model_terms"], where)
+    return Plan(fields["plan_id"], artifact, views, with_microscope(
         terms, fields["microscope"], f"{where}: microscope"))
-
-
-def _map_grid(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
-    """Return the nodes of the map; None if the plan does not give them."""
-    if not data:
-        return None
-    raw = checked_fields(data, where, {"grid_size": int}, {
-        "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
-        "grid_size_y": (int, 0)})
-    if raw["interpolation"] not in list(Interpolation):
-        raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
-                         f"use one of {', '.join(Interpolation)}")
-    sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
-    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.half, sizes, strict=True))
-    return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
-                   Interpolation(raw["interpolation"]), raw["grid_size_y"])
-
-
-def _with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str, ...]:
-    """Return the terms, including the microscope's from the plan."""
-    if not raw:
-        return terms
-    fields = checked_fields(raw, where, {}, {
-        "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
-    if any(term.startswith(TermName.MICROSCOPE) for term in terms):
-        raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
-    sizes = ":".join(f"{size:g}" for size in fields.values())
-    return tuple(map(str, parse_terms([*terms, f"{TermName.MICROSCOPE}:{sizes}"], where)))
-
-
-def _terms(texts: list, where: str) -> tuple[str, ...]:
-    where = f"{where}: model_terms"
-    for text in texts:
-        if not isinstance(text, str):
-            raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
-    return tuple(str(term) for term in parse_terms(texts, where))
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
