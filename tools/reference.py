@@ -49,6 +49,11 @@ PLAN = {
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
     "map.grid_size_y": "nodes along y if the map is not square; default: as along x",
+    "image": "marks that an image shows: detections of one stamp are one image (docs/bags.md); "
+             "default: one mark",
+    "image.nx": "marks along stage x, odd; the middle one is on the optical axis",
+    "image.ny": "marks along stage y, odd",
+    "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
     "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
@@ -145,7 +150,7 @@ def plan_keys() -> list[str]:
         "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
     strange = {"?": 1}
     return [*known_keys(whole | strange),
-            *(f"{part}.{key}" for part in ("map", "microscope", "check_stops")
+            *(f"{part}.{key}" for part in ("map", "image", "microscope", "check_stops")
               for key in known_keys(whole | {part: strange})),
             *(f"artifact.{key}" for key in known_keys(whole | {
                 "artifact": whole["artifact"] | strange})),

@@ -175,7 +175,7 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
     artifact = plan.artifact
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
              f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
-             *_nodes_text(plan),
+             *_nodes_text(plan), *_image_text(plan),
              f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
     if predicted is None or not seen.identifiable:
         lines += ["the plan does not identify the stage; unseen are:"]
@@ -197,6 +197,11 @@ def _nodes_text(plan: Plan) -> list[str]:
     grid, (nx, ny) = plan.artifact.map_grid, plan.artifact.field.shape
     return [] if grid is None else [f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
                                     f"apart, {grid.interpolation} between them"]
+
+
+def _image_text(plan: Plan) -> list[str]:
+    image = next((view.image for view in plan.views if view.image), None)
+    return [f"images of {image.nx} x {image.ny} marks"] if image else []
 
 
 def _check_stops_text(plan: Plan) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros.collection import inputs
 from selfcal_ros.collection.diagnosis import DetectionsSeen, EncoderFacts, RejectionFinding
 from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
-from selfcal_ros.collection.expected import ViewProgress, expected_marks, read_enough
+from selfcal_ros.collection.expected import ViewProgress, expected_marks, n_read_enough
 from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
@@ -247,8 +247,9 @@ class Collector:
             (min(stamps), max(stamps)), timeline.artifact, self._rules.identity, self.sense)
         progress = {index: view_progress(timeline, index, found, self._min_repeats)
                     for index, found in readings.items()}
-        return Measurements(timeline.plan_id, timeline.artifact, tuple(readings.values()),
-                            self.sense, dict(sorted(loose.items())), timeline.run_id,
+        parts = tuple(part for view in readings.values() for part in view.parts)
+        return Measurements(timeline.plan_id, timeline.artifact, parts, self.sense,
+                            dict(sorted(loose.items())), timeline.run_id,
                             timeline.model_terms), progress
 
     def findings(self, measurements: Measurements,
@@ -278,8 +279,8 @@ def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
     """Return the progress of a view."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
-    done, done_theta = read_enough(view, readings, min_repeats)
-    checked = min(count_stops(view, readings)[1], view.check_marks)
-    return ViewProgress(index, view, grid, int(done.sum()), angular, int(done_theta.sum()),
+    done, done_theta = n_read_enough(artifact, view, readings, min_repeats)
+    checked = min(max(count_stops(view, part)[1] for part in readings.parts), view.check_marks)
+    return ViewProgress(index, view, grid, done, angular, done_theta,
                         readings, max(i.end_ns for i in timeline.of_view(index)), artifact,
                         checked, min_repeats)

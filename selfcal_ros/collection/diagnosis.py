@@ -13,6 +13,7 @@ import numpy as np
 
 from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import REMEDY, Kind, Reason
+from selfcal_ros.collection.marks.cells import places_of_cells
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact
@@ -325,6 +326,7 @@ class DetectionsSeen:
         where = np.stack([stage.x.position, stage.y.position])
         where *= -1 if self.sense is Sense.PLATE_MOVES else 1
         good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
+        where += places_of_cells(view, np.stack([table["ox"], table["oy"]]))
         pose = view.on_stage(self.artifact)
         away = []
         for other in (pose, *other_poses(pose)):
@@ -351,6 +353,8 @@ class DetectionsSeen:
             if here.any() and readings.view.grid:
                 pose = readings.view.on_stage(self.artifact)
                 site = np.stack(pose.site_of(table["m"][here], table["n"][here])) * pitch
+                offset = np.stack([table["ox"][here], table["oy"][here]])
+                site = site - places_of_cells(readings.view, offset)
                 parts.append(np.concatenate([where[:, here], site]))
         both = np.concatenate(parts, axis=1)
         return both[:2], both[2:]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.collection.marks.cells import beside, marks_shown
 from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
@@ -35,8 +36,44 @@ def mark_rows(artifact: Artifact, view: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
-    """Return the numbers of grid marks and angular lines to be read in a view."""
-    return int(mark_rows(artifact, view)[1].sum()), artifact.angular_count if view.angular else 0
+    """Return the numbers of grid marks and angular lines to be read in a view.
+
+    Where images show several marks, those of every image are counted.
+    """
+    lines = artifact.angular_count if view.angular else 0
+    if view.image is not None and view.grid:
+        return sum(int(shown.sum()) for shown in marks_shown(artifact, view)), lines
+    return int(mark_rows(artifact, view)[1].sum()), lines
+
+
+def n_read_enough(artifact: Artifact, view: View, readings: ViewReadings,
+                  min_repeats: int = 0) -> tuple[int, int]:
+    """Return the numbers of grid marks and lines read often enough, see `read_enough`."""
+    if not readings.cells:
+        done, done_theta = read_enough(view, readings, min_repeats)
+        return int(done.sum()), int(done_theta.sum())
+    shown = marks_shown(artifact, view)
+    return (sum(int((marks & _read(artifact, part, min_repeats)).sum())
+                for marks, part in zip(shown, readings.cells, strict=True)),
+            int(read_enough(view, readings, min_repeats)[1].sum()))
+
+
+def _read(artifact: Artifact, part: ViewReadings, min_repeats: int) -> np.ndarray:
+    """Return the marks that were read often enough in a cell, bool (nx, ny)."""
+    done = read_enough(part.view, part, min_repeats)[0]
+    out = np.zeros(artifact.shape, dtype=bool)
+    out[part.m[done] + artifact.half[0], part.n[done] + artifact.half[1]] = True
+    return out
+
+
+def _missing_stops(artifact: Artifact, view: View, readings: ViewReadings,
+                   min_repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the marks (m, n) at which an image has to be taken again: not all of it was read."""
+    stops = np.zeros(artifact.shape, dtype=bool)
+    for marks, part in zip(marks_shown(artifact, view), readings.cells, strict=True):
+        stops |= beside(marks & ~_read(artifact, part, min_repeats), artifact, part.view, -1)
+    m, n = np.nonzero(stops)
+    return m[:NAMED_AT_MOST] - artifact.half[0], n[:NAMED_AT_MOST] - artifact.half[1]
 
 
 def read_enough(view: View, readings: ViewReadings,
@@ -64,16 +101,22 @@ def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndar
 
 def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
                   min_repeats: int = 0) -> Missing:
-    """Return the first marks, in the order of (m, n) and of k, not read often enough."""
+    """Return the first marks, in the order of (m, n) and of k, not read often enough.
+
+    Where images show several marks: those at which an image has to be taken again.
+    """
     first, count = mark_rows(artifact, view)
     grid, angular = expected_marks(artifact, view)
     end = np.cumsum(count)
     of_zero = end - count - first  # number of the mark n = 0 of each row
     done, done_theta = read_enough(view, readings, min_repeats)
+    lines = first_missing(np.sort(readings.k[done_theta]), angular)
+    if readings.cells:
+        m, n = _missing_stops(artifact, view, readings, min_repeats)
+        return Missing(tuple(m.tolist()), tuple(n.tolist()), tuple(lines.tolist()))
     row = readings.m[done] + artifact.half[0]
     number = first_missing(np.sort(of_zero[row] + readings.n[done]), grid)
     row = np.searchsorted(end, number, "right")
-    lines = first_missing(np.sort(readings.k[done_theta]), angular)
     return Missing(tuple((row - artifact.half[0]).tolist()),
                    tuple((number - of_zero[row]).tolist()), tuple(lines.tolist()))
 
@@ -116,7 +159,8 @@ class ViewProgress:
     def needed(self) -> int:
         """Smallest number of detections needed to complete the view."""
         repeats, have = self.view.repeats, 0
-        for count, tries in _tried(self.view, self.readings):
+        tried = [pair for part in self.readings.parts for pair in _tried(part.view, part)]
+        for count, tries in tried:
             more = repeats - count
             if self.min_repeats:
                 more = np.minimum(more, np.maximum(repeats - tries, self.min_repeats - count))

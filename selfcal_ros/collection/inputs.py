@@ -245,6 +245,7 @@ class Reason(StrEnum):
     ROTATION = "rotation_not_known"
     TOO_FAR = "too_far_from_nominal"
     NOT_AT_MARK = "stage_not_at_mark"
+    OUTSIDE_IMAGE = "outside_the_image"
     SEVERAL = "other_mark_of_one_exposure"
     LOW_SCORE = "low_score"
     DUPLICATE = "duplicate"
@@ -295,9 +296,11 @@ REMEDY = {
                     "of the offsets (m, stage axes) and the ids, or raise max_deviation",
     Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
                         "joint_y and measurement_sense, or set max_stage_distance",
-    Reason.SEVERAL: "an exposure shows several marks, and only that at which the stage stands is "
-                    "read: the stage's error is mapped where it stands; go to every mark, and "
-                    "publish of each image the mark nearest to the optical axis",
+    Reason.OUTSIDE_IMAGE: "they lie beyond the marks that an image shows; raise nx and ny under "
+                          "image in the plan",
+    Reason.SEVERAL: "an exposure shows several marks, and the plan knows of one; state in the plan "
+                    "how many an image shows (image: {nx: 3, ny: 3}), or publish the mark nearest "
+                    "to the optical axis alone",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
     Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
                     "or raise outlier_limit",

@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros.collection.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.exposures import Exposures, JointAt
 from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
-from selfcal_ros.collection.marks import identify
+from selfcal_ros.collection.marks import cells, identify
 from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
 from selfcal_ros.model.artifact import Artifact
@@ -144,13 +144,37 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
     `exposures` contain the stage at the instants of at least these detections.
     """
     rejected: Counter = Counter()
+    places = PlaceList()
     grid = _where(detections["kind"] == Kind.GRID, detections)
     angular = _where(detections["kind"] == Kind.ANGULAR, detections)
-    readings, phi = _reduce_grid(artifact, view, grid, exposures, rules, rejected)
-    part = _reduce_angular(artifact, view, angular, exposures, rules, rejected, phi)
-    used = int(readings["count"].sum() + part["count_theta"].sum())
-    return replace(ViewReadings(view), **readings, **part, used=used,
-                   rejected=dict(sorted((str(r), c) for r, c in rejected.items())))
+    marks = _grid_marks(artifact, view, grid, exposures=exposures, rules=rules, rejected=rejected,
+                        places=places)
+    lines = _reduce_angular(artifact, view, angular, exposures, rules, rejected, marks.phi_rad)
+    parts = []
+    for number, sub in enumerate(view.sub_views):
+        here = _reduce_grid(artifact, sub, marks.of_cell(number), rules, rejected, places)
+        with_lines = lines if sub.cell in (None, (0, 0)) else {}
+        parts.append(replace(ViewReadings(sub), **here, **with_lines, used=int(
+            here["count"].sum() + (lines["count_theta"].sum() if with_lines else 0))))
+    whole = parts[0] if parts[0].view is view else _of_image(view, parts, lines)
+    return replace(with_rejections(whole, dict(sorted((str(r), c) for r, c in rejected.items()))),
+                   places=places.places())
+
+
+def _of_image(view: View, parts: Sequence[ViewReadings], lines: dict) -> ViewReadings:
+    """Return the readings of a view with images from those of its cells, and of its lines."""
+    dof = sum(part.dof_xy for part in parts)
+    squares = sum(part.dof_xy * part.sigma_xy**2 for part in parts if part.dof_xy)
+    return replace(ViewReadings(view), **lines, cells=tuple(parts), dof_xy=dof,
+                   sigma_xy=float(np.sqrt(squares / dof)) if dof else float("nan"),
+                   used=sum(part.used for part in parts))
+
+
+def with_rejections(readings: ViewReadings, rejected: dict[str, int]) -> ViewReadings:
+    """Return the readings of a view with its rejections; of an image, in the cell of the axis."""
+    cells = tuple(replace(part, rejected=rejected, places=readings.places)
+                  if part.view.cell == (0, 0) else part for part in readings.cells)
+    return replace(readings, rejected=rejected, cells=cells)
 
 
 @dataclass(frozen=True)
@@ -158,7 +182,7 @@ class _GridMarks:
     """Grid detections whose marks are known: arrays (n,) and (2, n) in their order.
 
     `position` is that of the stage, `approach` its direction of approach; `phi_rad` is the view's
-    rotation if known from the marks.
+    rotation if known from the marks; `cell` is the index of the cell that shows the mark.
     """
 
     detections: np.ndarray
@@ -168,6 +192,18 @@ class _GridMarks:
     position: np.ndarray
     approach: np.ndarray
     phi_rad: float | None
+    cell: np.ndarray
+
+    def of_cell(self, number: int) -> "_GridMarks":
+        """Return the detections in one cell of the image."""
+        here = self.cell == number
+        if here.all():
+            return self
+        index, deviation, residual, position, approach = (
+            np.compress(here, values, axis=-1) for values in (
+                self.index, self.deviation, self.residual, self.position, self.approach))
+        return _GridMarks(self.detections[here], index, deviation, residual, position, approach,
+                          self.phi_rad, self.cell[here])
 
 
 def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exposures,
@@ -177,30 +213,32 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
     d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
+    offset = np.stack([d["ox"], d["oy"]])
+    number = cells.numbers_of(view, cells.cells_of(view, offset))
+    beside = cells.places_of_cells(view, offset)
     found = identify.identify_grid(
-        artifact, view, _reading(rules.sense, position, np.stack([d["ox"], d["oy"]])),
+        artifact, view, _reading(rules.sense, position, offset),
         ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
-        stage_m=_reading(rules.sense, position, 0.0))
+        stage_m=_reading(rules.sense, position, beside), beside_m=beside if view.image else None)
+    found.reasons[number < 0] = Reason.OUTSIDE_IMAGE
     away = found.reasons == Reason.NOT_AT_MARK
     if away.any():
         away &= np.isin(d["stamp"], d["stamp"][found.reasons == None])  # noqa: E711
         found.reasons[away] = Reason.SEVERAL
-    d, (position, index, deviation, residual, approach) = _keep(
+    d, (position, index, deviation, residual, approach, number) = _keep(
         d, found.reasons, rejected, position, found.index, found.deviation, found.residual,
-        approach, places=places)
+        approach, number, places=places)
     told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
     return _GridMarks(d, index, deviation, residual, position, approach,
-                      found.rigid.phi_rad if told else None)
+                      found.rigid.phi_rad if told else None, number)
 
 
-def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures, rules: Rules,
-                 rejected: Counter) -> tuple[dict, float | None]:
-    places = PlaceList()
-    marks = _grid_marks(artifact, view, d, exposures=exposures, rules=rules, rejected=rejected,
-                        places=places)
+def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules,
+                 rejected: Counter, places: PlaceList) -> dict:
+    """Return the grid readings of a view, or of a sub-view: offsets from the place of its cell."""
     d, (hx, hy) = marks.detections, artifact.half
     key = (marks.index[0] + hx) * (2 * hy + 1) + marks.index[1] + hy
-    offset = np.stack([d["ox"], d["oy"]])
+    offset = np.stack([d["ox"] - view.cell_m.real, d["oy"] - view.cell_m.imag])
     means = reduce_repeats(
         key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
         extent=2 * max(hx, hy) * artifact.grid_pitch_m, residual=marks.residual,
@@ -208,7 +246,6 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
     _count(rejected, Reason.OUTLIER, means.outlier)
     out = np.flatnonzero(means.outlier)
     places.add(np.full(len(out), Reason.OUTLIER, dtype=object), marks.position[:, out])
-    offset = np.stack([d["ox"], d["oy"]])
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
                          offset=offset, approach=marks.approach,
                          step_m=view.check_offset_m / 2 or np.inf)
@@ -217,7 +254,7 @@ def _reduce_grid(artifact: Artifact, view: View, d: np.ndarray, exposures: Expos
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
             "dof_xy": means.dof, "visits": visits, "motion": motion,
-            "places": places.places(), "outliers": _outliers_of(means, key)}, marks.phi_rad
+            "outliers": _outliers_of(means, key)}
 
 
 def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,

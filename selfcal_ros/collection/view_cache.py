@@ -2,13 +2,19 @@
 """All detections of a session, their views, and readings recomputed if necessary."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 
 from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import DETECTION, Reason
-from selfcal_ros.collection.reduce import Rules, canonical, clean, reduce_view, with_low_scores
+from selfcal_ros.collection.reduce import (
+    Rules,
+    canonical,
+    clean,
+    reduce_view,
+    with_low_scores,
+    with_rejections,
+)
 from selfcal_ros.collection.samples import GrowingColumns, GrowingTable
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.readings import ViewReadings
@@ -115,7 +121,7 @@ class ViewCache:
                                        rules=self._rules)
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})
-        return replace(readings, rejected=dict(sorted(total.items())))
+        return with_rejections(readings, dict(sorted(total.items())))
 
 
 def _different(views: np.ndarray) -> set[int]:

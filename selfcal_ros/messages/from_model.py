@@ -68,6 +68,13 @@ def _map_grid(artifact: Artifact | None) -> Fields:
             "map_interpolation": str(grid.interpolation) if grid else ""}
 
 
+def _image(view: View | None) -> Fields:
+    """Return the fields of the marks that an image shows; zeros without images."""
+    image = view.image if view else None
+    return {"image_nx": image.nx if image else 0, "image_ny": image.ny if image else 0,
+            "image_pitch": image.pitch_m if image else 0.0}
+
+
 def _view(view: View) -> Fields:
     return {"view_name": view.name, "rotation": view.rotation_rad,
             "translation_x": view.translation_m[0], "translation_y": view.translation_m[1],
@@ -84,7 +91,8 @@ def command(c: Command, frame_id: str) -> Fields:
             "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,
             "model_terms": list(c.model_terms),
             "check_marks": c.view.check_marks if c.view else 0,
-            "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact)}
+            "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact),
+            **_image(c.view)}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -108,12 +116,15 @@ def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: s
 
 def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_ns: int,
                      frame_id: str, notes: Iterable[str] = ()) -> Fields:
-    """Return the fields of a selfcal_msgs/ViewMeasurement; `notes` are lines on the session."""
+    """Return the fields of a selfcal_msgs/ViewMeasurement; `notes` are lines on the session.
+
+    With images there is one message for each of the readings' parts.
+    """
     readings = progress.readings
     arrays = ("m", "n", "dx", "dy", "count", "k", "dtheta", "count_theta", "u", "u_theta")
     return {
         "header": header(stamp_ns, frame_id), "plan_id": measurements.plan_id,
-        "view_index": progress.view_index, **_view(progress.view),
+        "view_index": progress.view_index, **_view(readings.view),
         **_artifact(measurements.artifact),
         **{name: getattr(readings, name) for name in arrays},
         "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
@@ -125,7 +136,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_visits(readings.visits), **_motion("motion", readings.motion),
         **_motion("motion_theta", readings.motion_theta), "run_id": measurements.run_id,
         "model_terms": list(measurements.model_terms), "session_notes": list(notes),
-        **_map_grid(measurements.artifact)}
+        **_map_grid(measurements.artifact), **_image(readings.view),
+        "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1]}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

@@ -20,6 +20,7 @@ from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.orders import parse_order
+from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
@@ -126,7 +127,25 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
     return View(str(message.view_name), float(message.rotation),
                 (float(message.translation_x), float(message.translation_y)), grid, angular,
                 repeats, _order_of(message), int(getattr(message, "check_marks", 0)),
-                float(getattr(message, "check_offset", 0.0)))
+                float(getattr(message, "check_offset", 0.0)), _image_of(message),
+                cell_of(message))
+
+
+def _image_of(message: Any) -> Image | None:
+    """Return the marks that an image shows; None where it is one, as in old bags."""
+    nx, ny = (int(getattr(message, name, 0)) for name in ("image_nx", "image_ny"))
+    if max(nx, ny) < 2:
+        return None
+    image = Image(nx, ny, float(message.image_pitch) or float(message.grid_pitch))
+    image.steps(artifact_of(message))
+    return image
+
+
+def cell_of(message: Any) -> tuple[int, int] | None:
+    """Return the cell of a ViewMeasurement; None without images, and for a ViewCommand."""
+    if not hasattr(message, "image_x") or _image_of(message) is None:
+        return None
+    return int(message.image_x), int(message.image_y)
 
 
 def _order_of(message: Any) -> str:

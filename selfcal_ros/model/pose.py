@@ -10,6 +10,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import Artifact
 
 LATTICE_TOLERANCE = 1e-3
@@ -240,6 +241,16 @@ class Pose:
             return (1, 1j, -1, -1j)[round(quarters) % 4]
         return complex(math.cos(self.turn_rad), math.sin(self.turn_rad))
 
+    @property
+    def quarters(self) -> int:
+        """Nearest whole number of quarter turns."""
+        return round(self.turn_rad / (math.pi / 2))
+
+    @property
+    def rows(self) -> complex:
+        """Direction of the rows of marks that is nearest to stage x, as a factor of length 1."""
+        return self.phase * (1, -1j, -1, 1j)[self.quarters % 4]
+
     def places(self, artifact: Artifact, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return the nominal places of marks on the stage, x + iy, complex, m."""
         return self.phase * (m + 1j * n) * artifact.grid_pitch_m + complex(*self.shift_m)
@@ -249,6 +260,54 @@ class Pose:
         places, (hx, hy) = self.places(artifact, artifact.m, artifact.n), artifact.field_half_m
         rounding = EDGE * artifact.grid_pitch_m
         return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)
+
+
+MOST_CELLS = 15
+"""Largest number of cells of an image along one side."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """Marks that an exposure shows: one in each cell around the optical axis.
+
+    Attributes
+    ----------
+    nx, ny : int
+        Cells along x and y, odd.
+    pitch_m : float
+        Distance between them, m; a whole number of the plate's pitches.
+
+    Raises
+    ------
+    InputError
+        For an even or excessive number, or no length.
+    """
+
+    nx: int
+    ny: int
+    pitch_m: float
+
+    def __post_init__(self) -> None:
+        """Refuse impossible images."""
+        for name, size in (("nx", self.nx), ("ny", self.ny)):
+            if not 1 <= size <= MOST_CELLS or size % 2 == 0:
+                raise InputError(f"image {name}", f"{size} is not an odd number from 1 to "
+                                 f"{MOST_CELLS}", "count the mark on the optical axis and as many "
+                                 "on either side of it")
+        if not (math.isfinite(self.pitch_m) and self.pitch_m > 0):
+            raise InputError("image pitch_m", f"{self.pitch_m} m is not a length",
+                             "give the distance between marks in metres")
+
+    @property
+    def cells(self) -> list[tuple[int, int]]:
+        """The cells (x, y) in their order; the one of the optical axis is (0, 0)."""
+        hx, hy = self.nx // 2, self.ny // 2
+        return [(x, y) for x in range(-hx, hx + 1) for y in range(-hy, hy + 1)]
+
+    def steps(self, artifact: Artifact) -> int:
+        """Return the distance between cells in pitches of the plate; InputError if not whole."""
+        return whole_steps(self.pitch_m / artifact.grid_pitch_m, "image pitch_m", "pitch",
+                           "let cells be whole pitches of the plate apart")
 
 
 def nearest_step(value: float) -> int | None:
@@ -263,3 +322,13 @@ def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:
     if whole is None:
         raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps", remedy)
     return whole
+
+
+def image_of(data: dict, artifact: Artifact, where: str) -> Image | None:
+    """Return the marks that an exposure shows; None if the plan says nothing, or one."""
+    if not data:
+        return None
+    raw = checked_fields(data, where, {"nx": int, "ny": int}, {"pitch_m": (float, 0.0)})
+    image = Image(raw["nx"], raw["ny"], raw["pitch_m"] or artifact.grid_pitch_m)
+    image.steps(artifact)
+    return image if len(image.cells) > 1 else None

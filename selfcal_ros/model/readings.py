@@ -2,7 +2,7 @@
 """Readings of the marks, view by view, and their digests."""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, ClassVar
@@ -163,6 +163,9 @@ class ViewReadings:
         Outliers among the repeats of each mark and line, additional to the count; empty if unknown.
     motion, motion_theta : RepeatMotion, optional
         Response of the offsets to the stage, in x and y and in angle; None without repeats.
+    cells : tuple of ViewReadings
+        In a view with images, the readings of the sub-views of the cells, in their order; grid
+        marks are then in these alone. Empty without images.
     """
 
     view: View
@@ -188,6 +191,12 @@ class ViewReadings:
     outliers_theta: np.ndarray = _empty(int)
     motion: RepeatMotion | None = None
     motion_theta: RepeatMotion | None = None
+    cells: tuple["ViewReadings", ...] = ()
+
+    @property
+    def parts(self) -> tuple["ViewReadings", ...]:
+        """The readings that are solved: those of the cells, or these."""
+        return self.cells or (self,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,6 +290,14 @@ def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
     return hashlib.sha256(repr((_KNOWN[readings], sorted(rejected.items()))).encode()).hexdigest()
 
 
+def view_digest(parts: Sequence[ViewReadings], rejected: dict[str, int]) -> str:
+    """Return one digest of the readings of a view: of all cells, if it has images."""
+    digests = [readings_digest(part, rejected) for part in parts]
+    if len(digests) == 1:
+        return digests[0]
+    return hashlib.sha256(repr(digests).encode()).hexdigest()
+
+
 _KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
 """Digests of readings still in use: those of a finished view are requested repeatedly."""
 
@@ -308,8 +325,7 @@ def placing_digest(artifact: Artifact, view: View) -> str:
                *view.translation_m, view.grid, view.angular, view.repeats,
                view.check_marks, view.check_offset_m)
     text = ",".join(float(number).hex() for number in numbers)
-    if artifact.map_grid is not None:
-        text += repr(artifact.map_grid)
+    text += "".join(repr(part) for part in (artifact.map_grid, view.image) if part is not None)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

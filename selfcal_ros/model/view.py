@@ -2,6 +2,7 @@
 """Views: poses of the plate on the stage; plans: the views to be measured."""
 
 import math
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,10 +18,12 @@ from selfcal_ros.model.artifact import (
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.pose import (
     OFF,
+    Image,
     LatticePose,
     PlacedPose,
     Pose,
     StagePose,
+    image_of,
     nearest_step,
     whole_steps,
 )
@@ -60,6 +63,11 @@ class View:
         Grid marks that are measured four more times, the stage at +x, -x, +y and -y of the mark.
     check_offset_m : float
         Distance of these stops from the mark, m.
+    image : Image, optional
+        Marks that an exposure shows; None = the one at which the stage stands.
+    cell : tuple of int, optional
+        Cell of the image, of a sub-view: the marks seen there, as a view of their own. The stage
+        stands beside them, at a pose of the plate shifted by minus the place of the cell.
     """
 
     name: str
@@ -71,6 +79,38 @@ class View:
     visit_order: str = ""
     check_marks: int = 0
     check_offset_m: float = 0.0
+    image: Image | None = None
+    cell: tuple[int, int] | None = None
+
+    @property
+    def cell_m(self) -> complex:
+        """Place of the sub-view's cell in the image, stage axes, x + iy, m; 0 without one."""
+        if self.image is None or self.cell is None:
+            return 0j
+        return self.pose.rows * complex(*self.cell) * self.image.pitch_m
+
+    @property
+    def image_cells(self) -> list[tuple[int, int]]:
+        """The cells of the image in their order; none without images."""
+        return self.image.cells if self.image is not None else []
+
+    @property
+    def plan_view(self) -> str:
+        """Name of the view in the plan: of a sub-view without its cell."""
+        return self.name if self.cell is None else self.name.removesuffix(_label(self.cell))
+
+    @property
+    def sub_views(self) -> tuple["View", ...]:
+        """The views of the cells of the image; lines belong to that of the optical axis."""
+        if self.image is None or self.cell is not None or not self.grid:
+            return (self,)
+        out = []
+        for cell in self.image.cells:
+            view = replace(self, name=self.name + _label(cell), cell=cell,
+                           angular=self.angular and cell == (0, 0))
+            x, y = self.translation_m
+            out.append(replace(view, translation_m=(x - view.cell_m.real, y - view.cell_m.imag)))
+        return tuple(out)
 
     def require_check_stops(self, artifact: Artifact) -> None:
         """Raise InputError for check stops that are impossible at the marks of this view.
@@ -163,6 +203,15 @@ class View:
                            "turn by whole lines, or set angular to false") % artifact.angular_count
 
 
+def _label(cell: tuple[int, int]) -> str:
+    return f"[{cell[0]:+d},{cell[1]:+d}]"
+
+
+def with_sub_views(views: Iterable[View]) -> tuple[View, ...]:
+    """Return the views, those with images as the sub-views of their cells."""
+    return tuple(sub for view in views for sub in view.sub_views)
+
+
 @dataclass(frozen=True)
 class Plan:
     """An artifact and the views in which it is to be measured, in their order.
@@ -204,8 +253,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
         interpolation, grid_size_y}``, the nodes of the map where they are not the plate's sites
         (default for views off the lattice: `default_map_grid`), ``model_terms``,
         a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
-        with grid marks, and ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
-        of the microscope.
+        with grid marks, ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
+        of the microscope, and ``image {nx, ny, pitch_m}``, marks that an exposure shows.
     where : str
         File name, for messages.
 
@@ -218,7 +267,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
                             {"visit_order": (str, ""), "model_terms": (list, []),
                              "check_stops": (dict, {}), "microscope": (dict, {}),
-                             "map": (dict, {})})
+                             "map": (dict, {}), "image": (dict, {})})
     raw = checked_fields(fields["artifact"], f"{where}: artifact",
                          {"grid_size": int, "grid_pitch": float, "angular_count": int},
                          {"grid_size_y": (int, 0)})
@@ -235,7 +284,12 @@ def plan_from_dict(data: object, where: str) -> Plan:
     if grid is None and not all(view.is_on_lattice(artifact) for view in views):
         grid = default_map_grid(artifact)
     artifact = replace(artifact, map_grid=grid)
-    views = tuple(_with_checks(view, *checks, artifact, where) for view in views)
+    image = image_of(fields["image"], artifact, f"{where}: image")
+    views = tuple(replace(_with_checks(view, *checks, artifact, where),
+                          image=image if view.grid else None) for view in views)
+    if len(with_sub_views(views)) > MAX_VIEWS:
+        raise InputError(f"{where}: image", f"{len(with_sub_views(views))} views with the cells of "
+                         f"the image are more than {MAX_VIEWS}", "state fewer marks in an image")
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
     names: set[str] = set()
@@ -332,8 +386,10 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     grid = artifact.map_grid
     nodes = {} if grid is None else {"map": map_grid_to_dict(grid)}
     marks, offset_m = plan.check_stops
+    image = next((view.image for view in plan.views if view.image), None)
     return {"plan_id": plan.plan_id, "artifact": plate, **nodes,
             "views": [view_to_dict(view, artifact) for view in plan.views],
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
+            **({"image": dict(vars(image))} if image else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})}
 

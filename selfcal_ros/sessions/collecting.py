@@ -5,6 +5,7 @@ import math
 import statistics
 from collections import Counter, deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.to_model import EncoderBlock
-from selfcal_ros.model.readings import Measurements, placing_digest, readings_digest, session_digest
+from selfcal_ros.model.readings import Measurements, placing_digest, session_digest, view_digest
 from selfcal_ros.sessions.clocks import ClockWatch, RunWatch
 from selfcal_ros.sessions.health import CellChecks, Diagnosis, Level, Ports, Rate, merged
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
@@ -220,7 +221,7 @@ class CollectingSession:
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
-            key = readings_digest(view.readings, measurements.rejected)
+            key = view_digest(view.readings.parts, measurements.rejected)
             closed = view.end_ns <= timeline.last_stamp_ns
             ready = final or closed or view.complete
             # empty, unless a previous collector may have sent its readings
@@ -229,8 +230,10 @@ class CollectingSession:
             is_new = self._published.get(index) != key or self._noted != self._stepped
             if ready and worth and is_new:
                 self._published[index], self._noted = key, self._stepped
-                self._ports.publish("measurement", from_model.view_measurement(
-                    view, measurements, stamp, frame_id, self._stepped))
+                for part in view.readings.parts:
+                    self._ports.publish("measurement", from_model.view_measurement(
+                        replace(view, readings=part), measurements, stamp, frame_id,
+                        self._stepped))
             # after the readings: a complete view can be solved
             if current or index == max(progress) or final:
                 fields = from_model.view_status(view, timeline.plan_id, stamp, frame_id,

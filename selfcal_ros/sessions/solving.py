@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of solver: readings solved together, results published and saved."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -15,7 +16,7 @@ from selfcal_ros.files import write_json
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
-from selfcal_ros.model.readings import Measurements, readings_digest, session_digest
+from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
 from selfcal_ros.reporting.summary.format import counted
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
@@ -39,6 +40,7 @@ class Job:
     digest: str
     stamp_ns: int
     notes: tuple[str, ...] = ()
+    views_done: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,7 @@ class SolvingSession:
 
     def __init__(self, settings: SolverSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
-        self._messages: dict[int, Any] = {}
+        self._messages: dict[tuple[int, int, int], Any] = {}  # by view, and cell of the image
         self._notes: tuple[str, ...] = ()  # on the session, from the newest message
         self._run = Run()
         self._planned: dict[Run, int] = {}
@@ -178,7 +180,8 @@ class SolvingSession:
                 return
             self._run, self._messages = run, {}
         # one collector, in order: its newest message on a view is valid
-        self._messages[message.view_index] = message
+        cell = to_model.cell_of(message) or (0, 0)
+        self._messages[message.view_index, *cell] = message
         self._notes = to_model.notes_of(message)
         self._stale = True
 
@@ -201,6 +204,24 @@ class SolvingSession:
                             to_model.counts(newest, "session_reject"), self._run.run_id,
                             to_model.terms_of(newest))
 
+    def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
+        """Return the readings, in the order of the messages, by their view in the plan."""
+        views: dict[int, list[ViewReadings]] = {}
+        for (index, *_), part in zip(sorted(self._messages), readings, strict=True):
+            views.setdefault(index, []).append(part)
+        return views
+
+    @property
+    def _views_done(self) -> int:
+        return len({index for index, *_ in self._messages})
+
+    @property
+    def _incomplete(self) -> bool:
+        """Whether cells of an image are still to come: they are sent one after the other."""
+        cells = Counter(index for index, *_ in self._messages)
+        return any(cells[index] < max(message.image_nx * message.image_ny, 1)
+                   for (index, *_), message in self._messages.items())
+
     def next_job(self) -> Job | None:
         """Return the next job, if readings have arrived since the last one.
 
@@ -209,20 +230,20 @@ class SolvingSession:
         SelfcalError
             If the readings cannot be used together; also shown as the state.
         """
-        if not self._stale:
+        if not self._stale or self._incomplete:
             return None
         self._stale = False
         try:
             measurements = self.measurements()
             digest = session_digest({
-                index: readings_digest(readings, measurements.rejected) for index, readings
-                in zip(sorted(self._messages), measurements.views, strict=True)})
+                index: view_digest(parts, measurements.rejected)
+                for index, parts in self._by_view(measurements.views).items()})
             options = solver_options(self._settings, measurements)
         except SelfcalError as error:
             self.shown.problem, self.shown.digest = error, ""
             raise
         stamp = max(to_model.stamp_ns(message) for message in self._messages.values())
-        return Job(self._run, measurements, options, digest, stamp, self._notes)
+        return Job(self._run, measurements, options, digest, stamp, self._notes, self._views_done)
 
     def take(self, outcome: Outcome) -> None:
         """Publish the outcome of a job, unless another run has begun meanwhile."""
@@ -232,7 +253,7 @@ class SolvingSession:
         if outcome.result is None:
             self._take_none(outcome)
             return
-        self.shown = Shown(outcome.result, outcome.problem, job.run, len(job.measurements.views),
+        self.shown = Shown(outcome.result, outcome.problem, job.run, job.views_done,
                            job.stamp_ns, job.digest)
         self._saved = ""
         self._publish(outcome.result)
@@ -242,8 +263,7 @@ class SolvingSession:
     def _take_none(self, outcome: Outcome) -> None:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
-        self.shown = Shown(None, outcome.problem, job.run, len(job.measurements.views),
-                           job.stamp_ns, "")
+        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns, "")
         if not self._unfinished():
             raise outcome.problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
@@ -358,7 +378,7 @@ class SolvingSession:
         state = self._state() if known else "waiting for views"
         return Diagnosis(Level.OK if fine and not newer else Level.WARN,
                          f"{newer}; {state}" if newer else state,
-                         {"views": len(self._messages), "readings": self.digest(),
+                         {"views": self._views_done, "readings": self.digest(),
                           "plan_id": self._run.plan_id, "run_id": self._run.run_id,
                           "left_aside": self._left_aside, "saved": self._saved})
 

@@ -54,6 +54,8 @@ class CellSettings:
         Whether the target is the actual position of the mark, not the nominal one.
     visit_xy_m : float
         Noise shared by all exposures of a visit.
+    image_xy_m : float
+        Noise shared by all marks of an image.
     flicker_xy_m, flicker_theta_rad : float
         Noise with a spectrum of 1/f over the exposures of a view.
     resolution_xy_m, resolution_theta_rad : float
@@ -84,6 +86,7 @@ class CellSettings:
     stop_sigma_theta_rad: float = 0.0
     follow_mark: bool = False
     visit_xy_m: float = 0.0
+    image_xy_m: float = 0.0
     flicker_xy_m: float = 0.0
     flicker_theta_rad: float = 0.0
     resolution_xy_m: float = 0.0
@@ -115,10 +118,6 @@ class CellSettings:
         return self.dwell_ns // 2 + 1
 
 
-NO_MOTION_M = 1e-6
-"""Largest change of an axis between stops that does not take up its backlash."""
-
-
 @dataclass(frozen=True, eq=False)
 class GridExposures:
     """Exposures of grid marks in their order.
@@ -141,6 +140,8 @@ class GridExposures:
         Sign of the last motion of each stage axis before the visit.
     site : float array (2, V)
         Nominal position of the mark in the stage frame, m.
+    others : tuple of Seen
+        What the other cells of the image show, in their order.
     """
 
     visits: VisitSequence
@@ -151,6 +152,17 @@ class GridExposures:
     there: np.ndarray
     approach: np.ndarray
     site: np.ndarray
+    others: tuple["Seen", ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a cell of the images shows: fields as in `GridExposures`, for the mark beside."""
+
+    cell: tuple[int, int]
+    offset: np.ndarray
+    mark: np.ndarray
+    there: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,43 +207,37 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
         stop = centre + physics.stage_error(truth, centre, index)
     stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
     came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
-    approach = np.stack([approach_signs(row, NO_MOTION_M)[1:] for row in came])
+    approach = np.stack([approach_signs(row, physics.NO_MOTION_M)[1:] for row in came])
     position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))
     lag = ((truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach[:, visit]
-           + _settling(truth, came, visit, settings.exposure_period_s))
+           + physics.settling(truth, came, visit, settings.exposure_period_s))
     stage = position - physics.stage_error(truth, position, index) - lag
     offset = physics.true_offset(settings.sense, place[:, visit] + moved, stage)
+    white = _white(rng, settings, size)
+    shared = (_normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
+              + _flicker(rng, settings.flicker_xy_m, (2, size))
+              + _normal(rng, settings.image_xy_m, (2, size)))
+    told = physics.seen_offset(truth, offset) + white + shared
+    indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
+    others = []
+    for sub in view.sub_views:
+        if sub.cell is not None and sub.cell != (0, 0):
+            marks = physics.marks_beside(truth, index, view, (m, n), sub)
+            away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
+            beside = physics.seen_offset(truth, physics.true_offset(
+                settings.sense, away[:, visit] + moved, stage))
+            others.append(Seen(sub.cell, quantised(
+                beside + _white(rng, settings, size) + shared, settings.resolution_xy_m),
+                np.stack(marks[:2]), there & marks[2]))
+    return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
+                         np.stack([m, n]), there, approach, site, tuple(others))
+
+
+def _white(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
+    """Return the noise of single marks, (2, E), m."""
     white = _normal(rng, settings.sigma_xy_m, (2, size))
     white *= np.array([[1.0], [settings.noise_ratio]])
-    told = (physics.seen_offset(truth, offset) + white
-            + _normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
-            + _flicker(rng, settings.flicker_xy_m, (2, size)))
-    indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
-    return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
-                         np.stack([m, n]), there, approach, site)
-
-
-def _settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
-              ) -> np.ndarray | float:
-    """Return the settling error of the axes at each exposure, (2, E), m.
-
-    Parameters
-    ----------
-    truth
-        The truth.
-    came : float array (2, V + 1)
-        Stops of the stage, beginning with the one before the first visit.
-    visit : int array (E,)
-        Index of the visit of each exposure.
-    period_s : float
-        Time from one exposure to the next.
-    """
-    if not truth.settling_m:
-        return 0.0
-    step = np.diff(came, axis=1)
-    sign = np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
-    rested = np.arange(len(visit)) - np.searchsorted(visit, visit)
-    return truth.settling_m * sign[:, visit] * np.exp(-rested * period_s / truth.settling_time_s)
+    return white
 
 
 def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
@@ -298,17 +304,17 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
     Every mark is visited `repeats` times, grid first. The first stamp is `start_ns`; the stage
     rests for a period, and approaches the first grid mark in + direction.
     """
-    stops, offsets, marks = _exposures(truth, index, plan.views[index], settings, rng)
+    stops, seen = _exposures(truth, index, plan.views[index], settings, rng)
     period_ns, step_ns = settings.period_ns, round(NS_PER_S / settings.encoder_rate_hz)
     end_ns = start_ns + period_ns * len(stops)
     exposed = 0
     for stamp in range(start_ns, end_ns + 1, step_ns):
-        while exposed < len(marks):
+        while exposed < len(seen):
             at = start_ns + (exposed + 1) * period_ns + settings.exposure_ns
             if at > stamp:
                 break
-            if (mark := marks[exposed]) is not None:
-                yield _detection(at, offsets[exposed], mark, settings)
+            for offset, mark in seen[exposed]:
+                yield _detection(at, offset, mark, settings)
             exposed += 1
         yield EncoderSample(stamp, JOINTS, _position(stops, stamp - start_ns, settings))
 
@@ -332,32 +338,35 @@ def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.ran
 
 def _exposures(truth: Truth, index: int, view: View, settings: CellSettings,
                rng: np.random.Generator,
-               ) -> tuple[np.ndarray, np.ndarray, list[tuple | None]]:
-    """Return stops (E + 1, 3), the first before any exposure, offsets (E, 3) and marks.
+               ) -> tuple[np.ndarray, list[list[tuple[np.ndarray, tuple]]]]:
+    """Return stops (E + 1, 3), the first before any exposure, and what each exposure shows.
 
-    A mark is (kind, m, n, k), None if the plate has none there.
+    Offset (3,) and mark (kind, m, n, k) of each; none if the plate has none there.
     """
-    stops, offsets = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    marks: list[tuple | None] = []
+    stops: list[np.ndarray] = [np.zeros((0, 3))]
+    shown: list[list[tuple[np.ndarray, tuple]]] = []
     if view.grid:
         grid = grid_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(grid.position.shape[1])
         stops.append(np.stack([*grid.position, zero], axis=1))
-        offsets.append(np.stack([*grid.offset, zero], axis=1))
-        m, n, there = (row[grid.visit].tolist() for row in (*grid.mark, grid.there))
-        marks += [(Kind.GRID, *ids, 0) if seen else None
-                  for *ids, seen in zip(m, n, there, strict=True)]
+        shown = [[] for _ in zero]
+        for cell in (Seen((0, 0), grid.offset, grid.mark, grid.there), *grid.others):
+            offsets = np.stack([*cell.offset, zero], axis=1)
+            m, n, there = (row[grid.visit].tolist() for row in (*cell.mark, cell.there))
+            for number in np.flatnonzero(there).tolist():
+                shown[number].append((offsets[number], (Kind.GRID, m[number], n[number], 0)))
     if view.angular:
         lines = angular_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(len(lines.k))
         stops.append(np.stack([zero, zero, lines.position], axis=1))
-        offsets.append(np.stack([zero, zero, lines.offset], axis=1))
-        marks += [(Kind.ANGULAR, 0, 0, k) for k in lines.line.tolist()]
+        offsets = np.stack([zero, zero, lines.offset], axis=1)
+        shown += [[(offset, (Kind.ANGULAR, 0, 0, k))]
+                  for offset, k in zip(offsets, lines.line.tolist(), strict=True)]
     every = np.concatenate(stops)
     before = every[:1].copy()
     if view.grid:
         before[:, :2] = lead_in(truth, before[:, :2])
-    return np.concatenate([before, every]), np.concatenate(offsets), marks
+    return np.concatenate([before, every]), shown
 
 
 def _position(stops: np.ndarray, elapsed_ns: int, settings: CellSettings) -> tuple[float, ...]:

@@ -12,6 +12,9 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.machine import DRIFT_POWERS, Truth
 
+NO_MOTION_M = 1e-6
+"""Largest change of an axis between stops that does not take up its backlash."""
+
 
 def rotate(q: int, vector: np.ndarray) -> np.ndarray:
     """Return `vector` (2, ...) turned counter-clockwise by `q` quarter turns, exactly."""
@@ -59,6 +62,21 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
     x, y = view.on_stage(artifact).site_of(*marks)
     m, n = np.rint(lies.turned_back(x - lies.shift[0], y - lies.shift[1])).astype(int)
     hx, hy = artifact.half
+    there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
+    return m * there, n * there, there
+
+
+def marks_beside(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray],
+                 sub_view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the marks that a cell of an image shows if `marks` are on the optical axis.
+
+    As `marks_below`; the nearest ones.
+    """
+    lies = truth.placed_as(index, view)
+    step = np.conj(lies.pose.phase) * sub_view.cell_m / truth.artifact.grid_pitch_m
+    m, n = (at + np.rint(part).astype(int) for at, part in zip(
+        marks, (step.real, step.imag), strict=True))
+    hx, hy = truth.artifact.half
     there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
     return m * there, n * there, there
 
@@ -126,6 +144,29 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
         steps = np.linspace(0, 1, truth.walk_m.shape[2])
         moved += np.stack([np.interp(tau, steps, row) for row in truth.walk_m[index]])
     return moved
+
+
+def settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
+             ) -> np.ndarray | float:
+    """Return the settling error of the axes at each exposure, (2, E), m.
+
+    Parameters
+    ----------
+    truth
+        The truth.
+    came : float array (2, V + 1)
+        Stops of the stage, beginning with the one before the first visit.
+    visit : int array (E,)
+        Index of the visit of each exposure.
+    period_s : float
+        Time from one exposure to the next.
+    """
+    if not truth.settling_m:
+        return 0.0
+    step = np.diff(came, axis=1)
+    sign = np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
+    rested = np.arange(len(visit)) - np.searchsorted(visit, visit)
+    return truth.settling_m * sign[:, visit] * np.exp(-rested * period_s / truth.settling_time_s)
 
 
 def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarray:

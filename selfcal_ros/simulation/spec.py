@@ -169,7 +169,7 @@ TRUTH: Section = (
     | _keys("correlation", unit="pitches", high=1000.0)
     | {name: _NODE[name] for name in ("encoder", "rotation")})
 NOISE: Section = {name: _NODE[name] for name in (
-    "sigma_xy", "sigma_theta", "noise_ratio", "visit_xy", "flicker_xy", "flicker_theta",
+    "sigma_xy", "sigma_theta", "noise_ratio", "visit_xy", "image_xy", "flicker_xy", "flicker_theta",
     "resolution_xy", "resolution_theta")}
 CELL: Section = {"sense": replace(_NODE["measurement_sense"], name="sense")} | {
     name: _NODE[name] for name in (

@@ -28,6 +28,7 @@ from selfcal_ros.model.readings import (
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.model.view import View
 from test.support.bags import contract_message, contract_types
+from test.support.plans import image_plan
 from test.support.results import known_result
 
 STAMPS = st.integers(0, (2**31 - 1) * 10**9 + 999_999_999)
@@ -110,6 +111,7 @@ def test_fields_of_a_detection_by_name():
 
 
 PLATE = Artifact(5, 0.0125, 8, 7, MapGrid(9, 0.02, Interpolation.BILINEAR, 11))
+NO_IMAGE = {"image_nx": 0, "image_ny": 0, "image_pitch": 0.0}
 MAP_FIELDS = {"map_grid_size": 9, "map_grid_size_y": 11, "map_grid_pitch": 0.02,
               "map_interpolation": "bilinear"}
 
@@ -124,7 +126,8 @@ def test_fields_of_a_command_by_name():
         "rotation": math.pi / 2, "translation_x": 0.01, "translation_y": -0.02, "grid": True,
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
-        "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS}
+        "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS,
+        **NO_IMAGE}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -222,6 +225,22 @@ PROGRESS = ViewProgress(18, replace(READ.view, check_marks=4, check_offset_m=2e-
                         READ, 23, check_done=23)
 
 
+def test_the_cell_of_an_image_comes_back():
+    (plan_view, *_) = image_plan(5).views
+    fields_of = from_model.command(Command(
+        STAMP_NS, Phase.MEASURE, "p", 0, plan_view, image_plan(5).artifact), "f")
+    assert to_model.command(through_cdr("ViewCommand", fields_of)).view == plan_view
+    unsaid = through_cdr("ViewCommand", {**fields_of, "image_pitch": 0.0})
+    assert to_model.command(unsaid).view == plan_view
+    for cell in plan_view.sub_views:
+        progress = replace(PROGRESS, readings=replace(READ, view=cell))
+        plate = replace(MEASURED, artifact=image_plan(5).artifact)
+        message = through_cdr("ViewMeasurement", from_model.view_measurement(
+            progress, plate, STAMP_NS, "f"))
+        assert to_model.view_readings(message).view == cell
+        assert to_model.cell_of(message) == cell.cell
+
+
 def test_the_plate_and_the_map_of_a_measurement_come_back():
     there = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     assert to_model.artifact_of(through_cdr("ViewMeasurement", there)) == MEASURED.artifact
@@ -263,7 +282,7 @@ def test_fields_of_a_view_measurement_by_name():
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
         "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
-        **MAP_FIELDS}
+        **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0}
 
 
 def test_fields_of_a_view_status_by_name():

@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
-from selfcal_ros.model.view import View, plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import View, plan_from_dict, plan_to_dict, with_sub_views
 
 PLATE = Artifact(11, 0.01, 24)
 PLAN = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 24},
@@ -262,3 +262,46 @@ def test_a_plan_knows_its_microscope():
         plan_from_dict(plan_with(microscope={"scale_u": 0.1}, model_terms=["microscope"]), "p")
     with pytest.raises(InputError, match="p: microscope: microscope: the size 2 is"):
         plan_from_dict(plan_with(microscope={"shear_u": 2.0}), "p")
+
+
+IMAGE = {"plan_id": "p", "artifact": {"grid_size": 7, "grid_pitch": 0.001, "angular_count": 8},
+         "views": [{"name": "a"}, {"name": "turned", "rotation_deg": 90,
+                                   "translation_pitch": [1, 0]}],
+         "image": {"nx": 3, "ny": 1}}
+
+
+def test_the_cells_of_an_image_are_views_at_shifted_poses():
+    plan = plan_from_dict(IMAGE, "p")
+    assert plan_from_dict(plan_to_dict(plan), "p") == plan
+    views = with_sub_views(plan.views)
+    assert [view.name for view in views[3:]] == ["turned[-1,+0]", "turned[+0,+0]", "turned[+1,+0]"]
+    assert [view.plan_view for view in views] == ["a"] * 3 + ["turned"] * 3
+    assert [view.on_stage(plan.artifact).shift for view in views[3:]] == [(2, 0), (1, 0), (0, 0)]
+    assert [view.cell_m for view in views[:3]] == [-0.001, 0, 0.001]
+    assert [view.angular for view in views[:3]] == [False, True, False]
+    assert with_sub_views(views) == views
+    alone = plan_from_dict(IMAGE | {"image": {"nx": 1, "ny": 1}}, "p")
+    assert with_sub_views(alone.views) == alone.views == tuple(
+        replace(view, image=None) for view in plan.views)
+
+
+def test_cells_of_a_plate_at_any_turn_follow_its_rows():
+    data = IMAGE | {"views": [{"name": "a", "rotation_deg": 100}]}
+    (_, _, right) = with_sub_views(plan_from_dict(data, "p").views)
+    assert right.cell_m == pytest.approx(0.001 * np.exp(1j * np.radians(10)))
+    assert complex(*right.translation_m) == pytest.approx(-right.cell_m)
+
+
+@pytest.mark.parametrize(("image", "told"), [
+    ({"nx": 2, "ny": 3}, "nx"), ({"nx": 3, "ny": 17}, "ny"), ({"nx": 3}, "ny"),
+    ({"nx": 3, "ny": 3, "pitch_m": 0.0015}, "pitch_m"),
+    ({"nx": 3, "ny": 3, "pitch_m": -1.0}, "pitch_m"), ({"nx": 3, "ny": 3, "px": 1}, "px")])
+def test_impossible_images_are_refused(image, told):
+    with pytest.raises(InputError, match=told):
+        plan_from_dict(IMAGE | {"image": image}, "p")
+
+
+def test_a_plan_has_no_more_cells_than_views():
+    many = [{"name": str(number)} for number in range(112)]
+    with pytest.raises(InputError, match="image"):
+        plan_from_dict(IMAGE | {"views": many, "image": {"nx": 3, "ny": 3}}, "p")

@@ -29,7 +29,7 @@ from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
-from test.support.plans import placed_plan
+from test.support.plans import image_plan, placed_plan
 from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
 
 
@@ -39,8 +39,9 @@ def undated(text: str) -> str:
     return re.sub('"created": "[^"]*"', '"created": ""', text)
 
 
-@pytest.fixture(scope="module", params=[None, placed_plan(count=8, repeats=2)],
-                ids=["on the lattice", "placed"])
+@pytest.fixture(scope="module", params=[None, placed_plan(count=8, repeats=2),
+                                        image_plan(5, count=8, repeats=2)],
+                ids=["on the lattice", "placed", "images"])
 def solved(request, tmp_path_factory):
     """Return a bag and the text of the result that `selfcal solve` writes for it."""
     folder = tmp_path_factory.mktemp("replay")

@@ -15,11 +15,13 @@ from selfcal_ros.collection.inputs import MAX_TEXT, Command, Detection, Kind, Ph
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages import from_model, to_model
+from selfcal_ros.model.readings import session_digest, view_digest
 from selfcal_ros.model.terms import DEFAULT_TERMS
 from selfcal_ros.sessions.clocks import Run, supersedes
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.plans import image_plan
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
@@ -488,3 +490,24 @@ def test_while_views_are_to_come_no_view_is_advised(desk, phase):
     short.session.take_command(command(1))
     short.take(views[:1])
     assert "add a view turned by 90" in short.hands.of("summary")[-1]["advice"][0]
+
+
+def test_the_cells_of_an_image_are_solved_together():
+    plan = image_plan(5, count=8)
+    _, measurements, progress = collected(events_of(plan))
+    messages = [message("ViewMeasurement", from_model.view_measurement(
+        replace(view, readings=part), measurements, 10 + index, "stage"))
+        for index, view in progress.items() for part in view.readings.parts]
+    assert len(messages) == 9 + 9 + 1
+    desk = Desk()
+    for item in messages[::-1][:-1]:
+        desk.session.take_measurement(item)
+    assert not desk.solve()  # a cell of the first view is still to come
+    desk.take(messages[:1])
+    assert desk.session.shown.views_done == 3
+    expected = calibrate(measurements)
+    np.testing.assert_array_equal(desk.session.result.error_map.gx, expected.error_map.gx)
+    np.testing.assert_array_equal(desk.session.result.error_map.u_gx, expected.error_map.u_gx)
+    assert desk.session.digest() == session_digest({
+        index: view_digest(view.readings.parts, measurements.rejected)
+        for index, view in progress.items()})

@@ -160,7 +160,7 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
-     "are sigma_xy, sigma_theta, noise_ratio, visit_xy, flicker_xy, flicker_theta, "
+     "are sigma_xy, sigma_theta, noise_ratio, visit_xy, image_xy, flicker_xy, flicker_theta, "
      "resolution_xy, resolution_theta"),
     ({"plan": PLAN, "placed": [{"name": "c"}]}, ": placed: the plan has no view 'c'; known are a, "
      "b"),

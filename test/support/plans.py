@@ -45,6 +45,22 @@ def plan_of(text: str, size: int = 5, *, count: int = 0, size_y: int = 0, line: 
     return Plan(text, artifact, tuple(views))
 
 
+def image_plan(size: int = 7, *, turns: tuple[float, ...] = (0, 90), count: int = 0,
+               repeats: int = 1, marks: int = 3) -> Plan:
+    """Return a plan of turned views of a plate whose images show `marks` x `marks` marks.
+
+    Lines are read in all views, and turned by one line.
+    """
+    lines = [{"name": "line", "rotation_deg": 360 / count, "grid": False,
+              "repeats": repeats}] if count else []
+    return plan_from_dict({
+        "plan_id": "images", "artifact": {"grid_size": size, "grid_pitch": 0.001,
+                                          "angular_count": count},
+        "image": {"nx": marks, "ny": marks},
+        "views": [{"name": f"{turn:g}", "rotation_deg": turn, "repeats": repeats}
+                  for turn in turns] + lines}, "image plan")
+
+
 def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1) -> Plan:
     """Return a plan of the views 0, 90, 37 deg and (1.3, -0.7) pitches, half a pitch.
 

@@ -58,8 +58,8 @@ class MarkAssignment:
 
 
 def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids: np.ndarray,
-                  has_id: np.ndarray, rules: IdentityRules,
-                  stage_m: np.ndarray | None = None) -> MarkAssignment:
+                  has_id: np.ndarray, rules: IdentityRules, stage_m: np.ndarray | None = None,
+                  beside_m: np.ndarray | None = None) -> MarkAssignment:
     """Identify grid marks and return their deviations from the nominal places of the view.
 
     A mark is rejected if the stage is not at its site, and not used for the others.
@@ -77,7 +77,9 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     rules : IdentityRules
         Limits.
     stage_m : float array (2, n), optional
-        Indicated site of the stage; None = at the mark.
+        Indicated site of the stage, plus `beside_m`; None = at the mark.
+    beside_m : float array (2, n), optional
+        Place in the image at which each mark is seen; None = at the optical axis.
     """
     pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     reasons = np.full(reading_m.shape[1], None, dtype=object)
@@ -92,8 +94,7 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
     astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
-    named = has_id & ~named_unknown & ~astray
-    free = ~has_id
+    named, free = has_id & ~named_unknown & ~astray, ~has_id
     known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
     rigid = known.rigid if fit.marks < 3 else fit.rigid
     far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
@@ -107,19 +108,18 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     site = np.stack(pose.site_of(marks[0], marks[1]))
     deviation = reading_m - site * pitch
     about = _about(pose, marks, pitch)
-    limit = min(rules.max_deviation_m, pitch / 4)
     number = marks[0] * (2 * artifact.half[1] + 1) + marks[1]
-    if _at_most_two(number[~far & ~ambiguous & ~unsure]):
-        limit = pitch / 4  # too few marks to know the view's own rotation and offset
+    few = _at_most_two(number[~far & ~ambiguous & ~unsure])  # the view's own motion is not known
+    limit = pitch / 4 if few else min(rules.max_deviation_m, pitch / 4)
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (distances(residual) > limit)
     astray |= _astray(pose, marks, stage_m, artifact, limit_m, among=free & ~far)
-    reasons[far] = Reason.TOO_FAR
-    reasons[astray] = Reason.NOT_AT_MARK
-    reasons[ambiguous] = Reason.AMBIGUOUS
-    reasons[unsure] = Reason.ROTATION
-    reasons[pose.beyond_field(site, artifact) & ~unsure] = Reason.NOT_IN_VIEW
-    reasons[named_unknown] = Reason.UNKNOWN_MARK
+    stop = site if beside_m is None else np.round(site - beside_m / pitch, 9)
+    beyond = pose.beyond_field(stop, artifact) & ~unsure
+    for where, reason in ((far, Reason.TOO_FAR), (astray, Reason.NOT_AT_MARK),
+                          (ambiguous, Reason.AMBIGUOUS), (unsure, Reason.ROTATION),
+                          (beyond, Reason.NOT_IN_VIEW), (named_unknown, Reason.UNKNOWN_MARK)):
+        reasons[where] = reason
     return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
 
 

@@ -276,6 +276,7 @@ class SimulatorSettings(Settings):
         "", "order of the marks if the command specifies none; empty = serpentine")
     consecutive: bool = declared(False, "all repeats of a mark consecutively, in one pass")
     visit_xy: float = declared(0.0, "noise shared by the exposures of a visit", **_LENGTH)
+    image_xy: float = declared(0.0, "noise shared by the marks of an image", **_LENGTH)
     flicker_xy: float = declared(0.0, "1/f noise of grid readings", **_LENGTH)
     flicker_theta: float = declared(0.0, "1/f noise of angular readings", **_ANGLE)
     resolution_xy: float = declared(0.0, "step of the offsets of marks", **_LENGTH)

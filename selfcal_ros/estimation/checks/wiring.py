@@ -117,8 +117,11 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
 def sign_is_shown(measurements: Measurements) -> bool:
     """Return whether the repeats of grid marks confirm the sign of the offsets.
 
-    All views together, compared with the opposite sign.
+    All views together, compared with the opposite sign. Images show it by themselves: with the
+    opposite sign their marks would be on the other side of the stage.
     """
+    if any(view.view.cell is not None and len(view.m) for view in measurements.views):
+        return True
     motions = [view.motion for view in measurements.views if view.motion is not None]
     if not motions:
         return False

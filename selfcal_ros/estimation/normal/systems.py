@@ -17,7 +17,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, with_sub_views
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
@@ -103,10 +103,11 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
     artifact : Artifact
         The plate.
     views : sequence of View
-        The plan.
+        The plan; the cells of images are views of their own.
     rank_only : bool
         Whether only the rank is needed.
     """
+    views = with_sub_views(views)
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
     poses = tuple(pose_of(view, artifact) for _, view in grid_views)
     angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]

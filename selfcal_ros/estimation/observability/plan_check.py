@@ -28,7 +28,7 @@ from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import Plan, View, with_sub_views
 
 SEARCH_SIZE = 9
 """Largest field for the search of a curing view, which is then verified on the real field."""
@@ -154,7 +154,9 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     own field, so the result is exact.
     """
     angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
-    candidates = candidate_views(plan.artifact, angular=angular)
+    image = next((view.image for view in plan.views if view.grid), None)
+    candidates = [replace(view, image=image if view.grid else None)
+                  for view in candidate_views(plan.artifact, angular=angular)]
     grid_only = [view for view in candidates if view.grid]
     small = smaller(plan, SEARCH_SIZE)
     found: list[tuple[View, ...]] = [()]
@@ -182,7 +184,8 @@ def smaller(plan: Plan, size: int) -> Plan:
     The field keeps its proportions, on which the uncertainty of a long field depends, and is
     large enough for the plan's own shifts.
     """
-    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m for view in plan.views]
+    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
+             for view in with_sub_views(plan.views)]
     room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
@@ -255,7 +258,7 @@ def measured_like(view: View, like: View) -> View:
     view = replace(view, repeats=like.repeats)
     return view if not view.grid else replace(
         view, visit_order=like.visit_order, check_marks=like.check_marks,
-        check_offset_m=like.check_offset_m)
+        check_offset_m=like.check_offset_m, image=like.image)
 
 
 def more_repeats(plan: Plan) -> list[Step]:

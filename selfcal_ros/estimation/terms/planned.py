@@ -32,7 +32,7 @@ from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, with_sub_views
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
 MISALIGNMENT_M = 30e-6
@@ -97,9 +97,11 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     rng = np.random.default_rng(SEED)
     x, y = assumed.error_m * np.random.default_rng([SEED, 1]).normal(size=(2, 2, *artifact.shape))
     errors = x + 1j * y
+    views = with_sub_views(views)
     grid_views = [views[i] for i in system.grid_index]
-    placed = np.array([ndtri((first + step * np.arange(len(grid_views))) % 1)
-                       for first, step in SPREAD]).T
+    placing = np.cumsum([view.cell is None or view.cell == view.image_cells[0]
+                         for view in grid_views]) - 1  # the cells of an image see one plate
+    placed = np.array([ndtri((first + step * placing) % 1) for first, step in SPREAD]).T
     visits = tuple(_visits(artifact, view, assumed, rng, (row, errors))
                    for row, view in zip(placed, grid_views, strict=True))
     lines = [views[i] for i in system.angular_index]
