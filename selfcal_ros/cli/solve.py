@@ -51,6 +51,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "uncertainty of this error, e.g. artifact:1.2e-6:3e-7")
     parser.add_argument("--certificate", metavar="TEXT",
                         help="certificate of the reference: number and issuer")
+    parser.add_argument("--reference-at", metavar="T:U_T:ALPHA:U_ALPHA[:T0]",
+                        help="move the certified length to the temperature of the measurement: "
+                        "T and its u, expansion coefficient and its u, temperature of the "
+                        "certificate (20), e.g. 20.4:0.05:0.5e-6:0.05e-6")
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
                         "plate_shape, approach, plate_strain, line_eccentricity, rotation; "
@@ -89,10 +93,13 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
         args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
         misalignment_model=args.misalignment, uncertainty=args.uncertainty,
         model_terms=_model(args), drift_degree=args.drift_degree,
-        reference_certificate=args.certificate, **_reference(args.reference))
-    if args.certificate is not None and solver.reference_kind == "none":
-        raise InputError("--certificate", "it belongs to a reference length, and none is given",
-                         "name the length with --reference KIND:ERROR:U")
+        reference_certificate=args.certificate, reference_at=args.reference_at,
+        **_reference(args.reference))
+    for option in ("certificate", "reference_at"):
+        if getattr(args, option) is not None and solver.reference_kind == "none":
+            raise InputError(f"--{option.replace('_', '-')}",
+                             "it belongs to a reference length, and none is given",
+                             "name the length with --reference KIND:ERROR:U")
     if args.misalignment == "rigid" and solver.method == "law":
         raise InputError("--misalignment", "Hu's law is linear, not rigid",
                          "omit it, or use --method joint")

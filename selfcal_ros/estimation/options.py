@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How to calibrate: method, datum, reference length, model of the misalignments."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from selfcal_ros.errors import InputError, known_are
@@ -10,6 +11,8 @@ from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, Mo
 
 METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
+MAX_EXPANSION_PER_K = 1e-3
+"""Coefficient of linear expansion above that of any solid, 1/K."""
 
 
 class ReferenceKind(StrEnum):
@@ -36,6 +39,9 @@ class ReferenceLength:
         Its standard uncertainty (k=1).
     certificate : str
         Certificate: number and issuer, as text.
+    certified : dict, optional
+        If the numbers above were moved to the temperature of the measurement (`at_temperature`):
+        those of the certificate, and what moved them.
 
     Raises
     ------
@@ -47,6 +53,7 @@ class ReferenceLength:
     relative_error: float
     u_relative: float = 0.0
     certificate: str = ""
+    certified: dict[str, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be relative errors."""
@@ -57,6 +64,42 @@ class ReferenceLength:
         if not 0 <= self.u_relative < 0.1:
             raise InputError("reference length", f"{self.u_relative} is not a standard "
                              "uncertainty of a relative error", "give a number from 0 to 0.1")
+
+    def at_temperature(self, text: str) -> "ReferenceLength":
+        """Return the length at the temperature of the measurement (method eq. 3.10).
+
+        Parameters
+        ----------
+        text : str
+            T:U_T:ALPHA:U_ALPHA[:T0]: temperature in the measurement and standard uncertainty, degC
+            and K; coefficient of linear expansion of what was certified (plate, or scale of
+            the axis) and standard uncertainty, 1/K; temperature of the certificate, degC (20).
+
+        Raises
+        ------
+        InputError
+            If the text is something else, or the uncertainties are negative.
+        """
+        names = ("temperature_c", "u_temperature_k", "expansion_per_k", "u_expansion_per_k",
+                 "certified_at_c")
+        try:
+            numbers = [*map(float, text.split(":"))]
+        except ValueError:
+            numbers = []
+        known = dict(zip(names, [*numbers, 20.0], strict=False))
+        if len(numbers) not in (4, 5) or not all(map(math.isfinite, numbers)) or min(
+                known["u_temperature_k"], known["u_expansion_per_k"]) < 0 or abs(
+                known["expansion_per_k"]) > MAX_EXPANSION_PER_K:
+            raise InputError("reference length", f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
+                             "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)")
+        warmer = known["temperature_c"] - known["certified_at_c"]
+        sign = 1 if self.kind is ReferenceKind.ARTIFACT else -1  # a longer scale indicates less
+        return replace(
+            self, relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
+            u_relative=math.hypot(self.u_relative, known["expansion_per_k"]
+                                  * known["u_temperature_k"], warmer * known["u_expansion_per_k"]),
+            certified={"relative_error": self.relative_error, "u_relative": self.u_relative,
+                       **known})
 
 
 @dataclass(frozen=True)

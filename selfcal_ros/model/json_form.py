@@ -148,4 +148,6 @@ def reference_from_dict(raw: Any) -> dict[str, Any] | None:
     if not (abs(error) < 0.1 and 0 <= u < 0.1):
         raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
     read(str, raw.get("certificate") or "")
+    for value in read(dict, raw.get("certified") or {}).values():
+        read(float, value)
     return raw

@@ -32,8 +32,8 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize(("words", "message"), [
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
-    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, diff, export, gcode, "
-     "monitor, plan, plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; "
+    ("", "selfcal: VERB is missing: one of apply, batch, cal, call, cell, certificate, combine, "
+     "diff, export, gcode, monitor, plan, plot, replay, report, reproduce, simulate, solve, step-diagonal, table, up; "
      "see selfcal --help"),
     ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
@@ -268,7 +268,8 @@ def test_a_word_that_is_no_verb_is_answered_from_all_verbs(word):
 RUNS = {
     "solve": "solve BAG -o s.json", "batch": "batch BAG -o batch", "diff": "diff S S",
     "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
-    "table": "table R -o t.csv",
+    "table": "table R -o t.csv", "combine": "combine R t.csv -o mean.json",
+    "certificate": "certificate R DETAILS -o c.xml",
     "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
@@ -290,6 +291,7 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     write_json("r.json", result_to_dict(known_result(5, 8)[0]))
     places = {"BAG": bag, "R": "r.json", "S": "s.json", "PLAN": bag.parent / "plan.yaml",
               "SIM": bag.parent / "simulation.yaml", "POINTS": "p.csv", "NC": "in.nc",
+              "DETAILS": root / "config/certificates/details.yaml",
               "DATA": root / "config/step_diagonal/case_study.csv"}
     Path("p.csv").write_text("x,y\n0,0\n")
     Path("in.nc").write_text("G0 X0 Y0\n")

@@ -24,6 +24,8 @@ def solver_options(settings: SolverSettings,
     reference = None if kind == "none" else ReferenceLength(
         ReferenceKind(kind), settings.reference_error, settings.reference_u,
         settings.reference_certificate)
+    if reference and settings.reference_at:
+        reference = reference.at_temperature(settings.reference_at)
     terms, origin = _terms(settings.model_terms, measurements)
     assumed = _assumed(settings)
     return Options(method=settings.method, datum_theta=ThetaDatum(settings.theta_datum),

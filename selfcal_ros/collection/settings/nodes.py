@@ -137,6 +137,9 @@ class SolverSettings(ManagedSettings):
         0.0, "standard uncertainty of reference_error (k=1)", "m/m", 0.0, 0.09)
     reference_certificate: str = declared(
         "", "certificate of that length: number and issuer")
+    reference_at: str = declared(
+        "", "temperatures that move it to the measurement, T:U_T:ALPHA:U_ALPHA[:T0] "
+        "(docs/certificate.md); empty = measured where it is used")
     model_terms: list[str] = declared(
         [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
         f"size is a standard deviation, SI; 0 = exactly zero; empty = those of the plan; "

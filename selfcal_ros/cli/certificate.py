@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal certificate``: a digital calibration certificate (DCC) of a result."""
+
+import argparse
+
+from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
+
+HELP = "write a digital calibration certificate: DCC 3.3.0 (XML)"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("result", metavar="RESULT.json", help="result of `selfcal solve` or "
+                        "`selfcal combine`")
+    parser.add_argument("details", metavar="DETAILS.yaml", help="laboratory, customer, item, "
+                        "persons, conditions (docs/certificate.md)")
+    parser.add_argument("-o", "--output", metavar="DCC.xml", required=True,
+                        help="certificate to write; - = stdout")
+    parser.add_argument("--covariance", action="store_true",
+                        help="include the covariance of all nodes, up to 21 x 21")
+    parser.add_argument("--not-qualified", action="store_true",
+                        help="certify a result that is not qualified, and state that it is not")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read result and details, write the certificate."""
+    from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.files import check_outputs, read_json, read_yaml, write_bytes
+    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.standards.dcc import certificate, is_traceable
+    from selfcal_ros.standards.details import details_from_dict
+
+    check_outputs([args.result, args.details], [file_of(args)])
+    result = result_from_dict(read_json(args.result), args.result)
+    details = details_from_dict(read_yaml(args.details), args.details)
+    xml = certificate(result, details, covariance=args.covariance,
+                      not_qualified=args.not_qualified)
+    if args.output == STDOUT:
+        say(args, xml.decode().removesuffix("\n"), {"xml": xml.decode()})
+        return exit_code(result)
+    write_bytes(args.output, xml)
+    traceable = is_traceable(result)
+    say(args, f"written: {args.output}, {'' if traceable else 'not '}traceable",
+        {"written": args.output, "traceable": traceable, "qualified": result.verdict.qualified})
+    return exit_code(result)

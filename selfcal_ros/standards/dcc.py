@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A digital calibration certificate: DCC 3.3.0 of the PTB with quantities in D-SI 2.2.1."""
+
+from collections.abc import Iterator, Sequence
+from datetime import date
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from selfcal_ros import __version__
+from selfcal_ros.apply import StageMap
+from selfcal_ros.errors import InputError, printable
+from selfcal_ros.estimation.comparison.covariance import first_order_u
+from selfcal_ros.estimation.verdict.uncertainty import budgets
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.chapters import convention_section
+from selfcal_ros.reporting.words.budget import line_text
+from selfcal_ros.reporting.words.tables import dof_text, excluded_text, quantity_text
+from selfcal_ros.standards.details import UNITS
+from selfcal_ros.units import UM_PER_M
+
+DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
+VERSION = "3.3.0"
+PROBABILITY = "0.9545"
+MAX_COVARIANCE = 21 * 21
+"""Largest number of nodes whose covariance is written: 10 MB."""
+METRE, RADIAN, ONE = r"\metre", r"\radian", r"\one"
+INVALID = "No statement of the uncertainty is valid: the readings contradict the model."
+
+
+def certificate(result: CalibrationResult, details: dict[str, Any], *, covariance: bool = False,
+                not_qualified: bool = False) -> bytes:
+    """Return the certificate of a calibration as XML.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        A calibration with uncertainties, worded.
+    details : dict
+        As `selfcal_ros.standards.details.details_from_dict` gives it.
+    covariance : bool
+        Whether the covariance of all nodes is included, not only U of distances.
+    not_qualified : bool
+        Whether a result that is not qualified is certified as such.
+
+    Raises
+    ------
+    NotIdentifiableError
+        If the result has no map.
+    InputError
+        If the result is not qualified and `not_qualified` is False, or has no uncertainties.
+    """
+    stage = StageMap(result)
+    if not result.has_uncertainty:
+        raise InputError("certificate", "the result has no uncertainties",
+                         "solve again with --uncertainty always")
+    if not result.verdict.qualified and not not_qualified:
+        raise InputError("certificate", "the result is not qualified: "
+                         f"{printable(result.verdict.sentence)}",
+                         "calibrate again, or let the certificate state it with --not-qualified")
+    for prefix, uri in (("dcc", DCC), ("si", SI)):
+        ET.register_namespace(prefix, uri)
+    root = _dcc("digitalCalibrationCertificate", _administration(result, details),
+                _results(stage, details, covariance=covariance))
+    root.set("schemaVersion", VERSION)
+    ET.indent(root, " ")
+    return ET.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+
+
+def _node(namespace: str, name: str, *content: ET.Element | str | None) -> ET.Element:
+    """Return an element with children, or with a text; None among the children is left out."""
+    found = ET.Element(f"{{{namespace}}}{name}")
+    for part in content:
+        if isinstance(part, str):
+            found.text = printable(part)
+        elif part is not None:
+            found.append(part)
+    return found
+
+
+def _dcc(name: str, *content: ET.Element | str | None) -> ET.Element:
+    return _node(DCC, name, *content)
+
+
+def _si(name: str, *content: ET.Element | str | None) -> ET.Element:
+    return _node(SI, name, *content)
+
+
+def _given(name: str, value: str | None) -> ET.Element | None:
+    return _dcc(name, value) if value else None
+
+
+def _content(name: str, *texts: str) -> ET.Element:
+    """Return an element of a text type, each text a paragraph."""
+    return _dcc(name, *(_dcc("content", text) for text in texts))
+
+
+def is_traceable(result: CalibrationResult) -> bool:
+    """Return whether a certified length, at the temperature of the measurement, sets the scale."""
+    reference = result.reference or {}
+    return bool(reference.get("certificate") and reference.get("certified")
+                and reference.get("u_relative"))
+
+
+def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.Element:
+    core, item, lab = details["certificate"], details["item"], details["laboratory"]
+    order = core.get("order")
+    persons = [_dcc("respPerson", _dcc("person", _content("name", person["name"])),
+                    _given("role", person.get("role")), _dcc("mainSigner", str(not i).lower()))
+               for i, person in enumerate(details["persons"])]
+    return _dcc(
+        "administrativeData",
+        _dcc("dccSoftware", _software()),
+        _dcc("coreData", _dcc("countryCodeISO3166_1", core["country"]),
+             _dcc("usedLangCodeISO639_1", core["language"]),
+             _dcc("mandatoryLangCodeISO639_1", core["language"]),
+             _dcc("uniqueIdentifier", core["id"]),
+             _dcc("identifications", _identification("calibrationLaboratory", order, "order"))
+             if order else None,
+             _dcc("beginPerformanceDate", core["begin"]), _dcc("endPerformanceDate", core["end"]),
+             _dcc("performanceLocation", core["place"]),
+             _dcc("issueDate", core.get("issued") or date.today().isoformat())),
+        _dcc("items", _dcc("item", *_thing(item, "manufacturer"))),
+        _dcc("calibrationLaboratory", _given("calibrationLaboratoryCode", lab.get("code")),
+             _dcc("contact", *_contact(lab))),
+        _dcc("respPersons", *persons),
+        _dcc("customer", *_contact(details["customer"])),
+        _dcc("statements", *_statements(result, details)))
+
+
+def _software() -> ET.Element:
+    return _dcc("software", _content("name", "selfcal_ros"), _dcc("release", __version__),
+                _dcc("type", "application"))
+
+
+def _identification(issuer: str, value: str, name: str) -> ET.Element:
+    return _dcc("identification", _dcc("issuer", issuer), _dcc("value", value),
+                _content("name", name))
+
+
+def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
+    """Yield the parts of an item or an equipment."""
+    yield _content("name", item["name"])
+    if "certificate" in item:
+        yield _content("description", f"certificate: {item['certificate']}")
+    if "manufacturer" in item:
+        yield _dcc("manufacturer", _content("name", item["manufacturer"]))
+    yield _given("model", item.get("model"))
+    if "serial_number" in item:
+        yield _dcc("identifications", _identification(issuer, item["serial_number"],
+                                                      "serial number"))
+
+
+def _contact(of: dict[str, str]) -> Iterator[ET.Element | None]:
+    yield _content("name", of["name"])
+    yield _given("eMail", of.get("email"))
+    yield _given("phone", of.get("phone"))
+    yield _dcc("location", _dcc("city", of["city"]), _dcc("countryCode", of["country"]),
+               _given("postCode", of.get("post_code")), _given("street", of.get("street")),
+               _given("streetNo", of.get("number")))
+
+
+def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[ET.Element]:
+    """Yield the statements on traceability, on the verdict, and the remarks."""
+    traceable = is_traceable(result)
+    yield _dcc("statement", _content("name", "Metrological traceability"),
+               _dcc("traceable", str(traceable).lower()),
+               _content("declaration", *_scale_texts(result)))
+    verdict = result.verdict
+    texts = [verdict.sentence or str(verdict.grade), *verdict.reasons]
+    yield _dcc("statement", _content("name", "Agreement of readings and model"),
+               _content("declaration", *texts, *([] if verdict.qualified else [INVALID])),
+               _dcc("valid", str(verdict.qualified).lower()))
+    for remark in details["remarks"]:
+        yield _dcc("statement", _content("name", "Remark"), _content("declaration", remark["text"]))
+
+
+def _scale_texts(result: CalibrationResult) -> list[str]:
+    reference = result.reference
+    if not reference:
+        return ["The scale of the map is a convention, relative to the encoders: no reference "
+                "length was used. Form, straightness and squareness do not depend on a reference."]
+    texts = [f"The scale is set by a reference length ({reference['kind']}): relative error "
+             f"{reference['relative_error']:.4g}, standard uncertainty "
+             f"{reference['u_relative']:.3g}; certificate: "
+             f"{reference.get('certificate') or 'none'}."]
+    if known := reference.get("certified"):
+        texts.append(
+            f"Certified at {known['certified_at_c']:g} °C: {known['relative_error']:.4g}, standard "
+            f"uncertainty {known['u_relative']:.3g}; used at {known['temperature_c']:g} °C "
+            f"(u {known['u_temperature_k']:g} K) with the expansion coefficient "
+            f"{known['expansion_per_k']:.4g} 1/K (u {known['u_expansion_per_k']:.2g} 1/K).")
+    if not is_traceable(result):
+        texts.append("Not traceable: this needs a certificate, its uncertainty, and the "
+                     "temperature of the reference (--certificate, --reference-at).")
+    return texts
+
+
+def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> ET.Element:
+    result = stage.result
+    conditions = [_dcc("influenceCondition", _content("name", item["name"]),
+                       _dcc("data", _condition(item))) for item in details["conditions"]]
+    equipment = [_dcc("measuringEquipment", *_thing(item, "manufacturer"))
+                 for item in details["equipment"]]
+    return _dcc(
+        "measurementResults",
+        _dcc("usedMethods", _dcc(
+            "usedMethod", _content("name", "Self-calibration of a stage with a plate in several "
+                                   "views"), _content("description", *_model_texts(result)),
+            _dcc("norm", "JCGM 100:2008"))),
+        _dcc("usedSoftware", _software()),
+        _dcc("measuringEquipments", *equipment) if equipment else None,
+        _dcc("influenceConditions", *conditions),
+        _dcc("measurementResult", _content("name", "Error map of the stage"),
+             _content("description", *(f"{name}: {text}" for name, text in
+                                       convention_section(result).facts)),
+             _dcc("results", *_maps(stage), *_budgets(result),
+                  *_correlations(stage, covariance=covariance)),
+             _dcc("measurementMetaData", *(_dcc("metaData", _content("name", name),
+                                                _content("description", text))
+                                           for name, text in _meta(result)))))
+
+
+def _model_texts(result: CalibrationResult) -> list[str]:
+    """Return the model: misalignments and terms with their sizes."""
+    texts = [f"{result.model.misalignment} misalignments of the plate in each view; method: "
+             f"{result.method}, {result.sense.replace('_', ' ')}"]
+    for term in result.model.terms:
+        size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
+        texts.append(f"term {term.name}: {size}, {term.source}")
+    return texts
+
+
+def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
+    """Yield what else is known of the measurement, by name."""
+    noise, made = result.noise, result.provenance
+    yield "plan", result.plan_id
+    for name in ("file", "sha256"):
+        if result.input.get(name):
+            yield f"readings, {name}", result.input[name]
+    for name, value in (("run", result.run_id), ("evaluated", made.created), *made.extra.items()):
+        if value:
+            yield name.replace("_", " "), str(value)
+    if np.isfinite(made.duration_s):
+        yield "duration", f"{made.duration_s:.0f} s"
+    for view in result.views:
+        yield f"view {view.name}", (f"turned {np.degrees(view.rotation):.6g}°, shifted "
+                                    f"({view.translation_x:.6g}, {view.translation_y:.6g}) m, "
+                                    f"{view.used} readings, {view.rejected} rejected")
+    for kind, name in (("xy", "x and y"), ("theta", "theta")):
+        if np.isfinite(k := getattr(noise, f"k_{kind}")):
+            yield f"coverage of {name}", (f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))}"
+                                          " degrees of freedom")
+    for line in result.excluded:
+        yield "outside the uncertainty", excluded_text(line)
+    for warning in result.warnings:
+        yield "warning", warning
+
+
+def _condition(item: dict[str, Any]) -> ET.Element:
+    if "text" in item and "value" not in item:
+        return _content("text", item["text"])
+    return _dcc("quantity", _content("description", item["text"]) if "text" in item else None,
+                _real(item["value"], UNITS[item["unit"]], item.get("u")))
+
+
+def _real(value: float, unit: str, u: float | None = None) -> ET.Element:
+    """Return a number with its unit, and U = 2 u if u is known."""
+    return _si("real", _si("value", _number(value)), _si("unit", unit), _si(
+        "measurementUncertaintyUnivariate", _si(
+            "expandedMU", _si("valueExpandedMU", _number(2 * u)), _si("coverageFactor", "2"),
+            _si("coverageProbability", PROBABILITY))) if u is not None else None)
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(map(_number, values))
+
+
+def _list(name: str, values: np.ndarray, unit: str,
+          u: tuple[np.ndarray, float] | None = None) -> ET.Element:
+    """Return a list of numbers; `u` are their standard uncertainties and the coverage factor."""
+    spread = None
+    if u is not None:
+        spread = _si("measurementUncertaintyUnivariateXMLList", _si(
+            "expandedMUXMLList", _si("valueExpandedMUXMLList", _numbers(u[1] * u[0])),
+            _si("coverageFactorXMLList", f"{u[1]:.4f}"),
+            _si("coverageProbabilityXMLList", PROBABILITY)))
+    return _dcc("quantity", _content("name", name), _si(
+        "realListXMLList", _si("valueXMLList", _numbers(values)), _si("unitXMLList", unit), spread))
+
+
+def _maps(stage: StageMap) -> Iterator[ET.Element]:
+    """Yield the maps: positions, errors and U of all known nodes and lines."""
+    result, emap, at = stage.result, stage.error_map, stage.error_map.artifact
+    known = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
+    k = result.noise.k_xy
+    yield _result("Error G = indicated - true in x and y at the nodes", _dcc(
+        "list", _list("x", at.x_m[known], METRE), _list("y", at.y_m[known], METRE),
+        _list("Gx", emap.gx[known], METRE, (emap.u_gx[known], k)),
+        _list("Gy", emap.gy[known], METRE, (emap.u_gy[known], k))))
+    u_o, u_r = (u if np.isfinite(u) else None for u in first_order_u(result))
+    yield _result("Squareness and difference of scales", _dcc(
+        "list", _scalar("non-orthogonality O, Gx = O y + R x, Gy = O x - R y",
+                        emap.nonorthogonality, RADIAN, u=u_o),
+        _scalar("scale difference R", emap.scale_difference, ONE, u=u_r)))
+    lines = np.isfinite(emap.g_theta + emap.u_g_theta)
+    if lines.any():
+        angle = 2 * np.pi * np.flatnonzero(lines) / at.angular_count
+        yield _result("Error of the angle at the lines, indicated - true", _dcc(
+            "list", _list("angle", angle, RADIAN),
+            _list("Gtheta", emap.g_theta[lines], RADIAN,
+                  (emap.u_g_theta[lines], result.noise.k_theta))))
+
+
+def _result(name: str, *data: ET.Element) -> ET.Element:
+    return _dcc("result", _content("name", name), _dcc("data", *data))
+
+
+def _scalar(name: str, value: float, unit: str, text: str = "", *,
+            u: float | None = None) -> ET.Element:
+    return _dcc("quantity", _content("name", name), _content("description", text) if text else None,
+                _real(value, unit, u))
+
+
+def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
+    """Yield the budgets: the standard uncertainty of each component, rms over the field."""
+    for budget in budgets(result):
+        unit = METRE if budget.unit == "m" else RADIAN
+        rows = [_scalar(f"{line.component} (type {line.kind})", line.effect_rms, unit,
+                        f"largest {line.effect_max:.3g}, {dof_text(line.dof)} degrees of freedom, "
+                        f"{line.source}: {line.text or line_text(line)}") for line in budget.lines]
+        rows.append(_scalar("combined standard uncertainty", budget.u_rms, unit,
+                            f"largest {budget.u_max:.3g}, {dof_text(budget.dof)} degrees of "
+                            "freedom"))
+        rows.append(_scalar("expanded uncertainty", budget.U_rms, unit,
+                            f"k = {budget.k:.3g} for 95.45 %, largest {budget.U_max:.3g}"))
+        yield _result(f"Uncertainty budget: {quantity_text(budget)}", _dcc("list", *rows))
+
+
+def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
+    """Yield U of distances, a + b L, and the covariance of all nodes if requested."""
+    emap, at = stage.error_map, stage.error_map.artifact
+    known = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
+    try:
+        a, b = stage.length_uncertainty()
+    except InputError as error:
+        if covariance:
+            raise
+        yield _result("Correlations", _content(
+            "text", f"The correlations between nodes are not known ({error.what})."))
+        return
+    yield _result("Expanded uncertainty of the distance L of two points, U = a + b L", _content(
+        "text", f"U of the distance of any two points of the field is at most {a * UM_PER_M:.3g} "
+        f"µm + {b * UM_PER_M:.3g} µm/m · L, k = {stage.result.noise.k_xy:.3g}, 95.45 %: errors of "
+        "neighbouring nodes are correlated."), _dcc(
+            "list", _scalar("a", a, METRE), _scalar("b", b, ONE)))
+    if not covariance:
+        return
+    if known.sum() > MAX_COVARIANCE:
+        raise InputError("--covariance", f"{int(known.sum())} nodes", "omit it: U of distances is "
+                         f"given; the covariance is written for up to {MAX_COVARIANCE} nodes")
+    full = stage.covariance(at.x_m[known], at.y_m[known])
+    columns = (_si("columnXMLList", _si("covarianceXMLList", _si("valueXMLList", _numbers(column)),
+                                        _si("unitXMLList", METRE + r"\tothe{2}")))
+               for column in full)
+    yield _result("Covariance of Gx, then Gy, at the nodes", _dcc(
+        "quantity", _content("name", "Gx, then Gy"), _si(
+            "realListXMLList", _si("valueXMLList", _numbers(np.concatenate([
+                emap.gx[known], emap.gy[known]]))), _si("unitXMLList", METRE), _si(
+                    "measurementUncertaintyMultivariateXMLList", _si(
+                        "ellipsoidalRegionMUXMLList",
+                        _si("covarianceMatrixXMLList", *columns),
+                        _si("coverageFactorXMLList", f"{stage.result.noise.k_xy:.4f}"),
+                        _si("coverageProbabilityXMLList", PROBABILITY))))))
