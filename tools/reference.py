@@ -56,7 +56,7 @@ PLAN = {
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
     "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
-    "artifact.angular_count": "K, angular lines; a multiple of 4, 0 without lines",
+    "artifact.angular_count": "K, angular lines, at least 3; 0 without lines",
     "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
     "views[].name": "name, unique",
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",

@@ -62,7 +62,8 @@ class Artifact:
     grid_pitch_m : float
         Distance between neighbouring marks, m.
     angular_count : int
-        K, number of angular lines; a multiple of 4, or 0 for a plate without them.
+        K, number of angular lines, at least 3; 0 for a plate without them. Lines are read in the
+        views that are turned by a whole number of them: at 90 deg if K is a multiple of 4.
     grid_size_y : int
         Number of marks along y; 0 means `grid_size`.
     map_grid : MapGrid, optional
@@ -71,7 +72,7 @@ class Artifact:
     Raises
     ------
     InputError
-        If a size is even, a size or the pitch is out of range, or K is not a multiple of 4.
+        If a size is even, a size or the pitch is out of range, or K is 1, 2 or negative.
     """
 
     grid_size: int
@@ -93,9 +94,9 @@ class Artifact:
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is no pitch of a "
                              f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
                              "is it in mm? give the distance between marks in metres")
-        if self.angular_count % 4 or not 0 <= self.angular_count <= MAX_ANGULAR_COUNT:
-            raise InputError("artifact angular_count", f"{self.angular_count} is not a multiple "
-                             "of 4", "give 0 for a plate without angular lines")
+        if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:
+            raise InputError("artifact angular_count", f"{self.angular_count} is not a number from "
+                             f"3 to {MAX_ANGULAR_COUNT}", "give 0 for a plate without lines")
         if self.map_grid is not None:
             try:
                 Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)

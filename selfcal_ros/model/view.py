@@ -170,7 +170,9 @@ class View:
             raise InputError(where, f"grid marks cannot be measured at a turn of "
                              f"{math.degrees(self.rotation_rad):.6g} deg",
                              f"turn by 90 deg, set grid to false, or place it on the {OFF}")
-        lines = self._lines(artifact) if artifact.angular_count else None
+        whole = nearest_step(self.rotation_rad * artifact.angular_count / (2 * math.pi)) is not None
+        lines = self._lines(artifact) if artifact.angular_count and (
+            self.angular or quarter is None or whole) else None
         if lines is None and quarter is None:
             raise InputError(where, "a turn that is not a quarter needs angular lines",
                              "turn by a multiple of 90 deg")

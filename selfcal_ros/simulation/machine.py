@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import datum_modes, half_axis_slopes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
@@ -354,6 +355,9 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
         return drawn
     if encoder == "independent":
         return drawn - drawn.mean()
+    if artifact.angular_count % 4:
+        raise InputError("encoder xy_axes", f"of {artifact.angular_count} lines none lies on the y "
+                         "axis", "use independent")
     slopes = half_axis_slopes(artifact, g)  # a half axis of one site has no slope
     quarter = drawn[:: artifact.angular_count // 4]
     quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)

@@ -72,7 +72,7 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     Raises
     ------
     InputError
-        For ``xy_axes`` if a half axis is not completely determined.
+        For ``xy_axes`` if a half axis is not completely determined, or has no line.
     """
     return _of_system.get(system, (datum, sense, half_width_m),
                           lambda: _conditions(system, datum, sense, half_width_m))
@@ -83,6 +83,9 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     known, n_lines = system.known_lines, system.angular.n_lines
     flipped = sense is Sense.PLATE_MOVES
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
+        if n_lines % 4:
+            raise InputError("theta datum xy_axes", f"of {n_lines} lines none lies on the y axis",
+                             "use zero_mean")
         sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
         slopes = slope_rows(system.grid.views.z_sites * half_width_m, sites)
         lines = np.arange(4) * (n_lines // 4)

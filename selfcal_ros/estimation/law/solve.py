@@ -130,8 +130,9 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
         If the plate or the views are not Hu's, or marks are missing.
     """
     artifact = measurements.artifact
-    if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count:
-        raise InputError("method law", "Hu's law needs a square plate with angular lines",
+    if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count or (
+            artifact.angular_count % 4):
+        raise InputError("method law", "Hu's law needs a square plate with 4, 8, 12, ... lines",
                          _JOINT)
     wanted: dict[tuple, int] = {
         (0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1, (0, (1, 0), 0): 3}

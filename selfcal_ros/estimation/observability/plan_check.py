@@ -137,7 +137,8 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     """
     pitch = artifact.grid_pitch_m
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
-    views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True, angular)
+    views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True,
+                  angular and q * artifact.angular_count % 4 == 0)
              for (a, b), name in names.items() for q in range(4)
              if q % 2 == 0 or artifact.shape[0] == artifact.shape[1] or (a, b) == (0, 0)]
     if angular and artifact.angular_count:

@@ -199,7 +199,8 @@ def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
                               ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
                               ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),
                               ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
-        more = View("", turn, shift, True, artifact.angular_count > 0)
+        more = View("", turn, shift, True, artifact.angular_count > 0 and (
+            not turn or artifact.angular_count % 4 == 0))
         if identifies(artifact, (*views, more)):
             return (f"add a view {name}",)
     return ("add views turned by 90 deg and shifted by one pitch along X and along Y",)

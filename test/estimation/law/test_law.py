@@ -184,7 +184,7 @@ def test_options_and_plates_that_the_law_does_not_know_are_refused():
                              (replace(LAW, misalignment_model="rigid"), "linear, not rigid")):
         with pytest.raises(InputError, match=message):
             calibrate(readings, options)
-    with pytest.raises(InputError, match="square plate with angular lines"):
+    with pytest.raises(InputError, match="square plate with 4, 8, 12"):
         calibrate(replace(readings, artifact=Artifact(5, 0.01, 8, 7)), LAW)
     _, small = measured(3, 4)
     with pytest.raises(InputError, match="has no slope"):
