@@ -4,8 +4,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "selfcal_ros"
-NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "bag_player",
-         "bag_recorder", "stage_simulator")
+NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
+         "bag_player", "bag_recorder", "stage_simulator")
 
 
 def share(folder: str) -> list[tuple[str, list[str]]]:

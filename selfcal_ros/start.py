@@ -50,7 +50,7 @@ def _run(node: str) -> int | None:
     return importlib.import_module(f"selfcal_ros.nodes.{node}").main()
 
 
-measurement_collector, pose_sequencer, solver, compensator, bag_player, bag_recorder, \
-    stage_simulator = (partial(_run, node) for node in (
-        "measurement_collector", "pose_sequencer", "solver", "compensator", "bag_player",
-        "bag_recorder", "stage_simulator"))
+measurement_collector, pose_sequencer, solver, compensator, mark_detector, bag_player, \
+    bag_recorder, stage_simulator = (partial(_run, node) for node in (
+        "measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
+        "bag_player", "bag_recorder", "stage_simulator"))

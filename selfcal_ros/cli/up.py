@@ -26,6 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "results; with --simulate journals_simulated)")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
+    parser.add_argument("--detect", action="store_true",
+                        help="find marks in stage/image as well (mark_detector in NODES.yaml)")
     parser.add_argument("--simulate", action="store_true",
                         help="also run a simulated cell, to try it out")
 
@@ -75,6 +77,8 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
              "pose_sequencer": with_parameters(plan=str(Path(args.plan).absolute()))}
     if args.compensate:
         nodes["compensator"] = with_parameters()
+    if args.detect:
+        nodes["mark_detector"] = with_parameters()
     if args.bag:
         nodes["bag_recorder"] = with_parameters(bag=str(Path(args.bag).absolute()))
     if args.simulate:

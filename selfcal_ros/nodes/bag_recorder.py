@@ -11,7 +11,7 @@ from selfcal_ros.collection.settings.nodes import RecorderSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
+from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.health import Diagnosis, Level
 
@@ -31,7 +31,8 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
             self._writer.add_topic(name, typename, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
-        EncoderInput(self, partial(self._record, kept_names(self, names.ENCODER)[0]), raw=True)
+        MatchedInput(self, names.ENCODER_EITHER, partial(
+            self._record, kept_names(self, names.ENCODER)[0]), raw=True)
         self._failed, self._unrecorded = "", 0
         self.every(1.0, self._flush)
 

@@ -19,7 +19,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.names import EncoderInput
+from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.cell_check import CellCheck
 from selfcal_ros.sessions.health import Level
@@ -38,7 +38,7 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         self.session = CellCheck(plan, self.settings, self.ports(
             lambda output, fields: self._outputs[output](fields)),
             settle_s=settle_s, patience_s=patience_s)
-        EncoderInput(self, self.session.take_encoder)
+        MatchedInput(self, names.ENCODER_EITHER, self.session.take_encoder)
         self.subscribe(names.DETECTIONS, self.session.take_detection)
         self.every(0.02, self._tick)
 

@@ -14,7 +14,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.managed import WhileConfigured, stop
-from selfcal_ros.nodes.names import EncoderInput, kept_names, offered
+from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.collecting import CollectingSession
@@ -90,7 +90,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         inputs = self._inputs
         self._detections = self.subscribe(names.DETECTIONS, inputs[names.DETECTIONS.name], raw=True)
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
-        EncoderInput(self, inputs[names.ENCODER.name], raw=True)
+        MatchedInput(self, names.ENCODER_EITHER, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
         self._busy = self.at_need(BUSY_S, self._on_timer)
         self._soon = self.at_need(SOON_S, self._on_soon)

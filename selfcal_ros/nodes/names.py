@@ -4,7 +4,7 @@
 Names are declared in `topics`.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 from selfcal_msgs import msg
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
@@ -45,7 +45,7 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
 
 # encoder at 1 kHz: a pause of a second must not overwrite a sample
 ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
-ENCODER_BEST_EFFORT = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False))
+ENCODER_EITHER = (ENCODER, Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False)))
 # corrected positions of earlier, displaced samples are useless
 ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
 DETECTIONS = Topic(topics.DETECTION_TOPIC, msg.MarkDetection, _qos(5000))
@@ -79,6 +79,15 @@ def of_node(node: str, topic: Topic) -> Topic:
 def private(topic: Topic) -> Topic:
     """Return the topic as named by the node itself."""
     return Topic(f"~/{topic.name}", topic.type, topic.qos)
+
+
+IMAGE_TYPES = {"raw": Image, "compressed": CompressedImage}
+
+
+def image_topics(transport: str, depth: int) -> tuple[Topic, Topic]:
+    """Return the topic of images, reliable and with best effort."""
+    name, kind = topics.IMAGE_TOPICS[transport], IMAGE_TYPES[transport]
+    return Topic(name, kind, _qos(depth)), Topic(name, kind, _qos(depth, reliable=False))
 
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
@@ -130,19 +139,32 @@ def _name(offer: Any) -> str:
     return f"{offer.node_namespace.rstrip('/')}/{offer.node_name}"
 
 
-class EncoderInput:
-    """Subscribe reliably if all publishers of the encoder are reliable, else with best effort.
+class MatchedInput:
+    """Subscribe reliably if all publishers of a topic are reliable, else with best effort.
 
     Checked ten times a second: a driver may appear late, or return with another offer.
+
+    Parameters
+    ----------
+    node : NodeBase
+        The subscriber.
+    topics : tuple of Topic
+        The topic, reliable and with best effort.
+    callback : callable
+        Takes a message.
+    **kwargs
+        For `NodeBase.subscribe`.
     """
 
-    def __init__(self, node: Any, callback: Callable[[Any], None], **kwargs: Any) -> None:
-        self._node, self._callback, self._kwargs = node, callback, kwargs
-        self._name = node.resolve_topic_name(ENCODER.name)
+    def __init__(self, node: Any, topics: tuple[Topic, Topic], callback: Any,
+                 **kwargs: Any) -> None:
+        self._node, self.callback, self._kwargs = node, callback, kwargs
+        self._topics = topics
+        self._name = node.resolve_topic_name(topics[0].name)
         self._topic: Topic | None = None
-        self._subscription: Any = None
+        self.subscription: Any = None
         self._match()
-        node.own(self, EncoderInput.close)
+        node.own(self, MatchedInput.close)
         node.every(0.1, self._match)
 
     def _match(self) -> None:
@@ -150,15 +172,15 @@ class EncoderInput:
         if not offers:
             return
         reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        topic = ENCODER if reliable else ENCODER_BEST_EFFORT
+        topic = self._topics[0 if reliable else 1]
         if topic is self._topic:
             return
         self.close()
         self._topic = topic
-        self._subscription = self._node.subscribe(topic, self._callback, **self._kwargs)
+        self.subscription = self._node.subscribe(topic, self.callback, **self._kwargs)
 
     def close(self) -> None:
         """End the subscription."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-        self._subscription = None
+        if self.subscription is not None:
+            self._node.destroy_subscription(self.subscription)
+        self.subscription = None

@@ -77,7 +77,7 @@ def rival(path: str) -> None:
         message.position = [*true, angle]
         publisher.publish(message)
     node.create_subscription(names.ENCODER.type, names.ENCODER.name, on_sample,
-                             names.ENCODER_BEST_EFFORT.qos)
+                             names.ENCODER_EITHER[1].qos)
     with contextlib.suppress(ExternalShutdownException, RCLError):  # the driver ends it
         rclpy.spin(node)
 

@@ -168,6 +168,17 @@ def test_impossible_requests_end_with_one_line(bag, tmp_path, capsys, arguments,
     assert not (tmp_path / "found").exists()
 
 
+def test_parameters_come_from_a_file_of_the_nodes(bag, tmp_path):
+    (tmp_path / "nodes.yaml").write_text(
+        "mark_detector: {ros__parameters: {pixel_size: 3.0e-6, mark_size: 60.0e-6, turn: 30.0,"
+        " mirror: true}}")
+    assert detect(bag, tmp_path / "a") == 0
+    assert main(["detect", str(bag), "-o", str(tmp_path / "b"), "--params",
+                 str(tmp_path / "nodes.yaml")]) == 0
+    found = [contents(tmp_path / name, f"/{DETECTION_TOPIC}") for name in "ab"]
+    assert found[0] == found[1]
+
+
 def test_topics_of_foreign_types_are_kept(bag, tmp_path):
     with (tmp_path / "foreign.mcap").open("wb") as file:
         writer = Writer(file)

@@ -42,7 +42,7 @@ def received(node, counts: dict[str, int]) -> bool:
 
 @pytest.mark.parametrize("offer, policy", [
     (names.ENCODER, ReliabilityPolicy.RELIABLE),
-    (names.ENCODER_BEST_EFFORT, ReliabilityPolicy.BEST_EFFORT)])
+    (names.ENCODER_EITHER[1], ReliabilityPolicy.BEST_EFFORT)])
 def test_the_encoder_is_taken_as_it_is_offered(graph, offer, policy):
     node = graph.node(MeasurementCollector)
     publisher = graph.publisher(offer)
@@ -55,7 +55,7 @@ def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
     node = graph.node(MeasurementCollector)
     graph.publisher(names.ENCODER)
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
-                                names.ENCODER_BEST_EFFORT.qos)
+                                names.ENCODER_EITHER[1].qos)
     graph.until(lambda: encoder_subscriptions(graph) == [ReliabilityPolicy.BEST_EFFORT],
                 "a subscription that matches both publishers")
     for publisher in list(graph.hand.publishers):

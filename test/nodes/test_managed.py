@@ -18,14 +18,17 @@ from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.sessions.health import Diagnosis, Level
+from test.support.cameras import DETECTS, camera
 from test.support.sessions import decoded, plan_file, small_plan
 
 MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
-           "solver": Solver, "compensator": CompensatorNode}
+           "solver": Solver, "compensator": CompensatorNode, "mark_detector": MarkDetectorNode}
+NEEDED = {"mark_detector": DETECTS}
 
 
 def entities(node) -> dict[str, int]:
@@ -45,7 +48,9 @@ def state(graph, node: str) -> str:
 
 @pytest.mark.parametrize("name", MANAGED)
 def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
-    node = graph.node(MANAGED[name], autostart=False)
+    images = camera(graph)
+    node = graph.node(MANAGED[name], autostart=False, **NEEDED.get(name, {}))
+    graph.until(lambda: node.get_publishers_info_by_topic(images.topic_name), "the camera")
     steps = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
              Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
     bare, full, sessions = entities(node), [], []
@@ -65,7 +70,7 @@ def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
 
 @pytest.mark.parametrize("name", MANAGED)
 def test_there_is_no_session_but_from_configuring_to_taking_down(graph, name):
-    node = graph.node(MANAGED[name], autostart=False)
+    node = graph.node(MANAGED[name], autostart=False, **NEEDED.get(name, {}))
 
     def refused():
         with pytest.raises(SelfcalError) as info:
@@ -154,7 +159,7 @@ def test_work_goes_on_under_a_simulated_time_that_stands_still(graph, tmp_path):
 
 @pytest.mark.parametrize("name", MANAGED)
 def test_a_destroyed_node_leaves_the_graph(graph, name):
-    node = graph.node(MANAGED[name])
+    node = graph.node(MANAGED[name], **NEEDED.get(name, {}))
     graph.until(lambda: name in graph.hand.get_node_names(), "the node")
     gc.disable()  # or it would go when circles of references are broken, some time later
     try:

@@ -12,15 +12,18 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
+from test.support.cameras import DETECTS
 from test.support.sessions import plan_file, small_bag, small_plan
 
 PARAMS = Path(__file__).parents[2] / "config" / "params"
 NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
          "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
+         "mark_detector": MarkDetectorNode,
          "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
 
 
@@ -36,6 +39,7 @@ def needed(files, tmp_path):
     """Return the parameters without which a node cannot run."""
     return {"bag_player": {"bag": files["bag"]},
             "bag_recorder": {"bag": str(tmp_path / "recorded")},
+            "mark_detector": DETECTS,
             "pose_sequencer": {"plan": files["plan"]}}
 
 

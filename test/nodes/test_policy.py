@@ -11,16 +11,19 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.monitor_session import MonitorSession
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
+from test.support.cameras import DETECTS, camera
 from test.support.sessions import plan_file, small_bag, small_plan
 
 POLICY = ElementTree.parse(Path(__file__).parents[2] / "config/sros2/policy.xml").getroot()
 NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
          "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
+         "mark_detector": MarkDetectorNode,
          "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
 KINDS = (("topics", "publish"), ("topics", "subscribe"), ("services", "reply"),
          ("services", "request"), ("actions", "execute"))
@@ -57,6 +60,8 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
     found = {kind: {name for name in names_ if "/_action/" not in name}
              for kind, names_ in found.items()}
     found["topics", "subscribe"] |= {"/clock"}  # with use_sim_time
+    if node == "mark_detector":  # with transport compressed
+        found["topics", "subscribe"] |= {"/stage/image/compressed"}
     return found | {("actions", "execute"): actions}
 
 
@@ -64,8 +69,10 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
 def test_a_node_is_granted_what_it_does_and_nothing_else(graph, tmp_path, name):
     parameters = {"bag_player": {"bag": str(small_bag(tmp_path)), "rate": 0.001},
                   "bag_recorder": {"bag": str(tmp_path / "new")},
+                  "mark_detector": DETECTS,
                   "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    camera(graph)
     node = graph.node(NODES[name], **parameters.get(name, {}))
     wanted = granted(name)
     with contextlib.suppress(AssertionError):

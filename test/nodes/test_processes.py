@@ -78,7 +78,8 @@ def ended(process: subprocess.Popen | Fork) -> tuple[int, str, str]:
 
 
 SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGTERM,
-           "solver": signal.SIGTERM, "compensator": signal.SIGINT, "bag_player": signal.SIGTERM,
+           "solver": signal.SIGTERM, "compensator": signal.SIGINT, "mark_detector": signal.SIGTERM,
+           "bag_player": signal.SIGTERM,
            "bag_recorder": signal.SIGTERM, "stage_simulator": signal.SIGINT}
 """One for each node: all of them take both through the same lines; `selfcal up` sends SIGTERM."""
 
@@ -87,6 +88,7 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
     needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001"],
               "bag_recorder": ["-p", f"bag:={recorded}"],
+              "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
               "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"]}
     diagnostics: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)

@@ -35,6 +35,6 @@ def test_every_input_has_the_depth_of_the_own_recorder():
 
 
 def test_it_hears_whatever_the_contract_lets_a_cell_offer():
-    for offer in (names.ENCODER, names.ENCODER_BEST_EFFORT, names.DETECTIONS, names.COMMAND):
+    for offer in (names.ENCODER, names.ENCODER_EITHER[1], names.DETECTIONS, names.COMMAND):
         verdict, reason = qos_check_compatible(offer.qos, overrides()[offer.name])
         assert verdict != QoSCompatibility.ERROR, reason

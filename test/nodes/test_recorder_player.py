@@ -108,7 +108,7 @@ def test_a_bag_is_played_at_its_own_pace_times_the_rate(played, bag):
 
 def test_an_encoder_with_best_effort_is_recorded(graph, tmp_path):
     recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
-    publisher = graph.publisher(names.ENCODER_BEST_EFFORT)
+    publisher = graph.publisher(names.ENCODER_EITHER[1])
     publisher.publish(names.ENCODER.type(name=["x"], position=[0.25]))
     graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the sample")
     recorder.close()
@@ -120,7 +120,7 @@ def test_an_encoder_that_comes_back_with_best_effort_is_recorded(graph, tmp_path
     first.publish(names.ENCODER.type(name=["x"], position=[0.25]))
     graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the first sample")
     graph.hand.destroy_publisher(first)
-    graph.publisher(names.ENCODER_BEST_EFFORT).publish(
+    graph.publisher(names.ENCODER_EITHER[1]).publish(
         names.ENCODER.type(name=["x"], position=[0.5]))
     graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 2, "the second sample")
     recorder.close()
@@ -210,7 +210,7 @@ def test_a_listener_of_one_topic_alone_is_not_enough(graph, bag):
 
 def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(graph, bag):
     driver = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
-                                         names.ENCODER_BEST_EFFORT.qos)
+                                         names.ENCODER_EITHER[1].qos)
     graph.node(MeasurementCollector)
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0).player
     graph.until(lambda: len(player.unheard()) == 1, "the collector")

@@ -294,3 +294,12 @@ def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line
         supervisor.step()
         supervisor.step()
         assert supervisor.log == [line]
+
+
+def test_marks_are_detected_on_request(tmp_path):
+    for more, there in (([], False), (["--detect"], True)):
+        args = build_parser("up").parse_args(
+            ["up", "--plan", "p.yaml", "--params", "n.yaml", "--results", str(tmp_path), *more])
+        nodes = up_verb.commands(args)
+        assert ("mark_detector" in nodes) is there
+    assert nodes["mark_detector"][1:] == ["--params-file", str(Path("n.yaml").absolute())]

@@ -8,6 +8,7 @@ the same classes, and the documentation is generated from them. An unknown name 
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.parameter import ManagedSettings, Parameter, Settings, declared
 from selfcal_ros.compensation.cells import Interpolation, Outside
 from selfcal_ros.errors import InputError, known_are
@@ -346,8 +347,8 @@ class SimulatorSettings(Settings):
 
 
 NODE_SETTINGS: dict[str, type[Settings]] = {kind.NODE: kind for kind in (
-    CollectorSettings, SolverSettings, SequencerSettings, CompensatorSettings, PlayerSettings,
-    RecorderSettings, SimulatorSettings)}
+    CollectorSettings, SolverSettings, SequencerSettings, CompensatorSettings,
+    DetectorSettings, PlayerSettings, RecorderSettings, SimulatorSettings)}
 NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
     node: kind.parameters() for node, kind in NODE_SETTINGS.items()}
 

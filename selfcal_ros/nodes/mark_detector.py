@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""mark_detector: images of a camera in, mark detections out."""
+
+import sys
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message
+
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.nodes import names
+from selfcal_ros.nodes.managed import WhileConfigured
+from selfcal_ros.nodes.names import MatchedInput
+from selfcal_ros.nodes.polling import ByTheClock, PollingNode
+from selfcal_ros.nodes.running import run
+from selfcal_ros.sessions.detecting import DetectingSession
+
+TICK_S = 0.2
+"""Period of counting lost images."""
+FEW = 4
+"""Number of waiting images taken at once: health and requests come in between."""
+PATIENCE_S = 5.0
+"""Longest wait at the end for the subscribers of the detections."""
+
+
+class MarkDetectorNode(PollingNode[DetectorSettings]):
+    """Publish the detections of each image with its stamp; images wait in the middleware."""
+
+    session = WhileConfigured[DetectingSession]()
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(DetectorSettings, **kwargs)
+
+    def configure(self) -> None:
+        """Create the session and the publisher."""
+        publish = self.output(names.DETECTIONS)
+        self.session = DetectingSession(self.settings, self.ports(
+            lambda output, fields: publish(fields)))
+
+    def activate(self) -> None:
+        """Subscribe to the images."""
+        # undone last: remaining images are used, and their detections delivered
+        self.own(None, lambda _: self._deliver())
+        topics = names.image_topics(self.settings.transport, self.settings.max_waiting)
+        self._kind = topics[0].type
+        images = ByTheClock(topics[0].name, self.guarded(self._take, topics[0].name), lambda: None)
+        self._input = MatchedInput(self, topics, images, raw=True)
+        self.every(TICK_S, self._look)
+
+    def _take(self, data: bytes, _received_ns: int) -> None:
+        self.session.take(deserialize_message(data, self._kind))
+
+    def _look(self) -> None:
+        """Take a few waiting images, and count the lost ones by their numbers."""
+        if self._input.subscription is not None:
+            self._empty(self._input.subscription, self._input.callback, FEW)
+
+    def _deliver(self) -> None:
+        for publisher in self.publishers:
+            if publisher.topic_name == self.resolve_topic_name(names.DETECTIONS.name):
+                publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run(MarkDetectorNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of mark_detector: what its health says."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.sessions.detecting import MANY_EMPTY, DetectingSession
+from selfcal_ros.sessions.health import Level
+from selfcal_ros.simulation.rendering import Camera
+
+CAMERA = Camera(width=90, height=80)
+
+
+@pytest.fixture
+def desk():
+    sent = []
+    ports = SimpleNamespace(publish=lambda output, fields: sent.append((output, fields)))
+    session = DetectingSession(DetectorSettings(pixel_size=2e-6, mark_size=5e-5, frame_id="f"),
+                               ports)
+    return SimpleNamespace(session=session, sent=sent)
+
+
+def image(stamp, values):
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=5))
+    return SimpleNamespace(header=header, height=values.shape[0], width=values.shape[1],
+                           encoding="mono8", is_bigendian=0, step=values.shape[1],
+                           data=values.tobytes())
+
+
+def drawn(marks=1):
+    return CAMERA.image(np.zeros((2, marks)), np.random.default_rng(1))
+
+
+def test_it_waits_for_an_image(desk):
+    assert desk.session.diagnosis().message == "no image yet"
+    assert desk.session.diagnosis().level == Level.WARN
+
+
+def test_detections_have_frame_and_stamp_of_their_image(desk):
+    desk.session.take(image(3, drawn()))
+    [(output, fields)] = desk.sent
+    assert output == "detection"
+    assert fields["header"] == {"stamp": {"sec": 3, "nanosec": 5}, "frame_id": "f"}
+    found = desk.session.diagnosis()
+    assert (found.level, found.message) == (Level.OK, "1 marks in 1 images")
+    assert float(found.values["ms_per_image_max"]) > 0
+    assert "ms_per_image_max" not in desk.session.diagnosis().values  # since the last one
+
+
+@pytest.mark.parametrize("values, why", [
+    (drawn(0), "nothing looks like one: check mark, mark_size, pixel_size and polarity"),
+    (drawn()[25:], "most rejected as cut_off")])
+def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values, why):
+    for number in range(MANY_EMPTY):
+        assert desk.session.diagnosis().message != f"no mark in the last {number} images, {why}"
+        desk.session.take(image(number + 1, values))
+    found = desk.session.diagnosis()
+    assert (found.level, found.message) == (
+        Level.WARN, f"no mark in the last {MANY_EMPTY} images, {why}")
+    assert not desk.sent
+
+
+def test_a_refused_image_is_counted(desk):
+    desk.session.take(image(3, drawn()))
+    with pytest.raises(InputError, match="stamp is not later"):
+        desk.session.take(image(3, drawn()))
+    assert desk.session.diagnosis().values["images_refused"] == 1
+    assert len(desk.sent) == 1
