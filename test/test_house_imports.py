@@ -11,8 +11,8 @@ from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
 ESTIMATION = ("options", "checks", "blas_threads", "lattice", "multifrontal", "normal",
-              "datum", "terms", "observability", "joint", "law", "verdict", "api", "quality",
-              "comparison")
+              "datum", "terms", "observability", "joint", "law", "verdict", "comparison",
+              "recheck", "api", "quality")
 """The parts of estimation/: each imports only those before it."""
 
 MODULES_OF_A_FOLDER = 12

@@ -161,7 +161,11 @@ def run(args: argparse.Namespace) -> int:
     said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
     for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
         print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
-    options = solver_options(solver, measurements)
+    options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
+    for name in ("validate", "robust"):
+        if options.plate is not None and getattr(args, name):
+            raise InputError(f"--{name}", f"the plate is known from {options.plate_from}, and one "
+                             "view holds nothing to judge its readings by", "omit it")
     try:
         with busy("solving"):
             result = _calibrated(args, measurements, options)
@@ -183,6 +187,7 @@ def run(args: argparse.Namespace) -> int:
         write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
+        lines += _since(result)
         lines += _budget(result) if args.budget else []
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
@@ -235,6 +240,15 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
         lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
             found, result.plate))]
     return result, lines
+
+
+def _since(result: Any) -> list[str]:
+    """Return the change since the calibration of a known plate as it is printed."""
+    from selfcal_ros.reporting.words.rechecks import recheck_lines
+
+    found = result.extra.get("recheck")
+    return [] if found is None else ["", f"change since {found['of']}:", *(
+        f"  {line}" for line in recheck_lines(found))]
 
 
 def _budget(result: Any) -> list[str]:

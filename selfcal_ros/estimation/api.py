@@ -8,6 +8,8 @@ from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.recheck.known import known_plate
+from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
@@ -24,7 +26,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     measurements : Measurements
         All readings, in any order within a view.
     options : Options, optional
-        Method, datum, reference length, model.
+        Method, datum, reference length, model, known plate.
 
     Returns
     -------
@@ -43,6 +45,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     """
     check_wiring(measurements)
     options = options or Options()
+    if options.plate is not None:
+        return recheck(measurements, options, known_plate(options.plate, options.plate_from))
     solve = solve_law if options.method == "law" else solve_joint
     result = judged(solve(measurements, options), measurements, options)
     if not result.verdict.qualified:

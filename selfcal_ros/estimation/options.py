@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
 
 METHODS = ("joint", "law")
@@ -137,6 +138,10 @@ class Options:
         site of their mark.
     magnification_limit : float
         Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
+    plate : CalibrationResult, optional
+        Calibration that made the plate known: its map is given, and the stage's is rechecked.
+    plate_from : str
+        Its file, for messages.
 
     Raises
     ------
@@ -156,6 +161,8 @@ class Options:
     assumed: tuple[ModelTerm, ...] = DEFAULT_TERMS
     at_places: bool = True
     magnification_limit: float = 1e-4
+    plate: CalibrationResult | None = None
+    plate_from: str = ""
 
     def __post_init__(self) -> None:
         """Fill in the model of the method; refuse unknown names."""

@@ -219,6 +219,8 @@ class Measurements:
         Run of the plan: the stamp of its first command, ns, as text; empty if unknown.
     model_terms : tuple of str
         Terms of the plan to be estimated with the map, see `selfcal_ros.model.terms`.
+    artifact_from : str
+        RESULT.json of the calibration that made the plate known; empty if it is not.
     """
 
     plan_id: str
@@ -228,6 +230,7 @@ class Measurements:
     rejected: dict[str, int] = field(default_factory=dict)
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
+    artifact_from: str = ""
 
     def all_rejected(self) -> dict[str, int]:
         """Return reason -> count over all views and outside them, sorted by reason."""

@@ -4,22 +4,26 @@
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.files import read_json
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import CalibrationResult, result_from_dict
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 
 
-def solver_options(settings: SolverSettings,
-                   measurements: Measurements | None = None) -> Options:
+def solver_options(settings: SolverSettings, measurements: Measurements | None = None, *,
+                   plate_from: str = "") -> Options:
     """Return the estimator's options in a solver's settings.
 
-    If `model_terms` is empty, the terms in the plan of the `measurements` are used.
+    If `model_terms` is empty, the terms in the plan of the `measurements` are used; if `plate_from`
+    is, the calibration of the plate that the plan names.
 
     Raises
     ------
     InputError
-        For invalid terms.
+        For invalid terms, or if there is no result of the plate's calibration.
     """
+    plate_from = plate_from or (measurements.artifact_from if measurements is not None else "")
     kind = settings.reference_kind
     reference = None if kind == "none" else ReferenceLength(
         ReferenceKind(kind), settings.reference_error, settings.reference_u,
@@ -33,8 +37,20 @@ def solver_options(settings: SolverSettings,
                    settings.misalignment_model, reference=reference,
                    uncertainty=UNCERTAINTY[settings.uncertainty],
                    terms=terms, terms_from=origin if terms else "", assumed=assumed,
-                   drift_degree=settings.drift_degree,
+                   drift_degree=settings.drift_degree, plate_from=plate_from,
+                   plate=calibration_of(plate_from) if plate_from else None,
                    magnification_limit=settings.magnification_limit)
+
+
+def calibration_of(path: str) -> CalibrationResult:
+    """Return the calibration in a RESULT.json.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    return result_from_dict(read_json(path), path)
 
 
 def _terms(given: list[str],

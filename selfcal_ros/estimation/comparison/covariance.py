@@ -191,7 +191,7 @@ def tells_what_was_read(result: CalibrationResult) -> bool:
 
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
     """Return the system behind a result; None if unknown or the stage is not identified."""
-    if np.isnan(result.error_map.u_gx).all() or not result.views:
+    if np.isnan(result.error_map.u_gx).all() or not result.views or "recheck" in result.extra:
         return None
     if tells_what_was_read(result):
         return _read_system(result) if result.observability.identifiable else None

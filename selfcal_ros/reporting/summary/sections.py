@@ -324,7 +324,7 @@ def state_sentence(result: CalibrationResult) -> str:
     k = result.noise.k_theta
     text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
     if result.verdict.grade is Grade.GOOD:
-        return text
+        return f"{result.verdict.sentence}. {text}" if "recheck" in result.extra else text
     said = printable(result.verdict.sentence).rstrip(".")
     return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
 

@@ -7,6 +7,10 @@ from selfcal_ros.model.verdict import BudgetLine
 _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
            "declared": "declared by the detections"}
 
+OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
+              "terms": "sizes of the terms of the model, which these views do not tell"}
+"""How a line of the budget was found, given the file of the plate."""
+
 
 def line_text(line: BudgetLine) -> str:
     """Return how a line of the budget was found."""
@@ -27,6 +31,8 @@ def line_text(line: BudgetLine) -> str:
                     line.component, f"uncertainties of {of['runs']} runs, by their weights")
     if "kind" in of:
         return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
+    if "plate" in of:
+        return OF_RECHECK[line.component].format(of["plate"])
     if line.component == INTERPOLATION:
         nodes = "sites" if line.quantity == "xy" else "lines"
         return f"curvature of the map; assumes that it is smooth between {nodes}"

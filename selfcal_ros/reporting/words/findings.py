@@ -9,9 +9,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.reporting.words import rechecks
 from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
@@ -174,6 +176,7 @@ SENTENCES: dict[str, Words] = {
     "axes_not_met": lambda f, of: (
         "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
         f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"),
+    "changed": rechecks.changed_text, "plate_misfit": rechecks.misfit_text,
     "prediction_failed": lambda f, of: (
         f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
         f"beyond the limit of {of['limit']:.2f}"),
@@ -329,21 +332,17 @@ def sentence_of(found: Finding) -> str:
 
 
 def worded(result: CalibrationResult) -> CalibrationResult:
-    """Return a result with the texts of its findings; existing texts are kept.
-
-    Parameters
-    ----------
-    result : CalibrationResult
-        As `selfcal_ros.estimation.api.calibrate` gives it, with its validation if there is one.
-    """
+    """Return a result with the texts of its findings; existing texts are kept."""
     findings = tuple(map(_with_text, result.findings))
     new = (found.text for found, old in zip(findings, result.findings, strict=True)
            if not old.text)
     verdict = worded_verdict(result.verdict, result.noise)
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
         verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
-    return replace(result, verdict=verdict,
-                   findings=findings, warnings=(*result.warnings, *new), budget=tuple(
+    if RECHECK in result.extra and verdict.qualified:
+        verdict = replace(verdict, sentence=rechecks.recheck_sentence(result.extra[RECHECK]))
+    return replace(result, verdict=verdict, findings=findings,
+                   warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))
 
 
@@ -354,12 +353,7 @@ def _with_text[Kind: Finding](found: Kind) -> Kind:
 def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
     """Return a verdict with its sentence, its reasons and the texts of its findings.
 
-    Parameters
-    ----------
-    verdict : Verdict
-        As estimation gives it, or as a file has it.
-    noise : Noise
-        Of the same result: whether there was something to compare residuals with.
+    `noise` of the same result tells whether there was something to compare residuals with.
     """
     new = [found for found in (*verdict.failed, *verdict.causes) if not found.text]
     if verdict.sentence and not new:

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views of a known plate to a result: the map of the stage, its uncertainty, what has changed."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc
+
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.joint.noise import (
+    F_LEVEL,
+    MIN_REPEAT_DOF,
+    SAME,
+    NoiseEstimate,
+    coverage_factor,
+    noise_estimate,
+)
+from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
+from selfcal_ros.estimation.joint.solve import weights_read
+from selfcal_ros.estimation.joint.solved import noise_of
+from selfcal_ros.estimation.lattice.connectivity import Gauge
+from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
+from selfcal_ros.estimation.normal.systems import system_for
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.recheck.change import (
+    NewLines,
+    NewMap,
+    joint_dof,
+    line_change,
+    map_change,
+    record,
+)
+from selfcal_ros.estimation.recheck.known import KnownPlate, on_plate
+from selfcal_ros.estimation.recheck.views import (
+    Gain,
+    PlateReadings,
+    Seen,
+    line_gain,
+    seen_field,
+    stacked,
+)
+from selfcal_ros.estimation.terms.columns import term_columns
+from selfcal_ros.estimation.terms.ground import ground_of, without_noise
+from selfcal_ros.estimation.terms.places import places_of
+from selfcal_ros.estimation.verdict.judge import provenance_of
+from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.result import CalibrationResult, Noise, Observability, ViewResult
+from selfcal_ros.model.statistics import MANY_DOF, rms
+from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
+
+KEY = "recheck"
+"""Key of what a recheck found among the extras of a result."""
+
+
+@one_thread()
+def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> CalibrationResult:
+    """Return the map of the stage from views of a known plate, and what has changed.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Views of the plate, one or more.
+    options : Options
+        Terms of the model, with sizes.
+    plate : KnownPlate
+        The plate.
+
+    Raises
+    ------
+    NoDataError, NotIdentifiableError, InputError
+        If no known mark was read, too little is known, or the readings do not fit the plate.
+    """
+    if options.method != "joint" or options.reference is not None:
+        raise InputError("options", "a recheck has the method joint, and the reference length of "
+                         "the plate's calibration", "leave them out")
+    readings = plate_readings(on_plate(measurements, plate), options, plate)
+    xy, theta = _noise(readings.problem, plate)
+    new, seen = _new_map(readings, plate, xy, options)
+    lines = _new_lines(readings, plate, theta)
+    found = record(map_change(new, plate), line_change(lines, plate),
+                   new.artifact, plate.where)
+    parts = new.variances(plate)
+    emap = _error_map(readings, new, lines, plate, parts)
+    noise = _with_coverage(noise_of(xy, theta), parts, plate)
+    failed, before = _misfit(seen, xy.dof), plate.result.verdict
+    result = CalibrationResult(
+        measurements.plan_id, emap, plate.result.artifact_map, _views(readings, seen),
+        _observability(seen), noise, measurements.all_rejected(),
+        findings=(Finding("changed", found["largest"]["change"], found["largest"]["u"], "m",
+                          found["p"], axis=found["largest"]["axis"], details={
+                              "x": found["largest"]["x"], "y": found["largest"]["y"],
+                              "of": plate.where}),) * found["changed"],
+        sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
+        verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
+                        enlarged_by=before.enlarged_by),
+        model=ModelResult("rigid" if options.finite_rotations else "linear",
+                          _term_results(options, readings)),
+        reference=plate.result.reference, provenance=provenance_of(measurements, options),
+        placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
+        else None)
+    return replace(result, budget=tuple(_budget(result, parts, plate)))
+
+
+def plate_readings(measurements: Measurements, options: Options,
+                   plate: KnownPlate) -> PlateReadings:
+    """Return the readings of known marks, and the terms of the model."""
+    grid, angular = grid_data(measurements), angular_data(measurements)
+    grid = replace(grid, weight=np.where(plate.kept.marks, grid.weight, 0.0))
+    if not grid.weight.any():
+        raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
+                          "record detections of the marks of the plate")
+    artifact, system = measurements.artifact, system_for(grid, angular)
+    views, length = system.grid.views, artifact.grid_pitch_m * max(artifact.half)
+    ground = ground_of(measurements, grid, length)
+    terms = _terms(options, visits=all(v is not None for v in ground.visits))
+    lines, shape = artifact.angular_count, views.z_sites.shape
+    nothing = Conditions(ThetaDatum.ZERO_MEAN, np.zeros((0, lines)), np.zeros((0, *shape)),
+                         np.zeros((lines, 0)), np.zeros((len(angular.index), 0)))
+    read = np.zeros(views.z_sites.size, dtype=bool)
+    read[views.site_index[grid.weight > 0]] = True
+    problem = Problem(
+        system, grid, angular, *repeats_of(measurements), length, nothing, True, ground,
+        rigid=options.finite_rotations, terms=terms, drift_degree=options.drift_degree,
+        places=places_of(measurements, grid, ground, read.reshape(shape) if isinstance(
+            views, LatticeViews) else np.ones(shape, dtype=bool)),
+        at_places=options.at_places, turn_rad=np.zeros(len(grid.index)))
+    problem = turned(problem) if problem.rigid else problem
+    quiet = without_noise(problem.ground, np.zeros(grid.y.shape))
+    return PlateReadings(measurements, problem, term_columns(quiet, terms, options.drift_degree),
+                         np.nonzero(grid.weight))
+
+
+def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
+    """Return the terms of the model; views of a known plate do not tell those without a size."""
+    terms = tuple(term for term in options.model_terms(
+        visits=visits, assumed=options.finite_rotations) if term.name is not TermName.ROTATION)
+    for term in terms:
+        if term.free:
+            raise InputError("model_terms", f"the term '{term.name}' has no size, and views of a "
+                             "known plate do not tell it", f"give it one, {term.name}:SIZE")
+    return terms
+
+
+def _noise(problem: Problem, plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
+    """Return the noise of the readings: declared, of many repeats, or that of the calibration."""
+    before, out = plate.result.noise, []
+    for kind, repeats, data in (("xy", problem.repeats_xy, problem.grid),
+                                ("theta", problem.repeats_theta, problem.angular)):
+        found = noise_estimate(repeats, (float("nan"), 0), data.sigma_declared)
+        if not (found.sigma > 0 and found.dof >= MIN_REPEAT_DOF):
+            found = replace(found, sigma=getattr(before, f"sigma_{kind}"),
+                            dof=getattr(before, f"dof_{kind}"))
+        out.append(found)
+    return out[0], out[1]
+
+
+def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
+             options: Options) -> tuple[NewMap, Seen]:
+    """Return the map of the stage, stage frame, and as it was solved."""
+    values, size = readings.of_terms()
+    terms = stacked(values) * size
+    noise = np.diag(np.tile(xy.sigma**2 / readings.weight, 2)) + terms @ terms.T
+    microscope, size = readings.of_microscope()
+    found = plate.microscope
+    if found is None or any(term.name is TermName.MICROSCOPE for term in options.terms):
+        own, found = stacked(microscope) * size, np.zeros(4)
+        noise, microscope = noise + own @ own.T, 0 * microscope
+    marks, of_marks = readings.of_marks()
+    of_plate = np.hstack([of_marks, stacked(microscope)])
+    nowhere = np.zeros(plate.kept.sites.shape, dtype=bool)
+    whole = noise + of_plate @ plate.kept.cover(nowhere, marks) @ of_plate.T
+    seen = seen_field(readings, whole, plate.field[readings.at[1:]], microscope @ found)
+    n, field, known = seen.known.size, seen.field, seen.known
+    rows = seen.gain.rows[:2 * n].reshape(2, *known.shape, -1)
+    if readings.measurements.sense is Sense.PLATE_MOVES:  # G(X) = -H(-X)
+        field, known, rows = -field[::-1, ::-1], known[::-1, ::-1], -rows[:, ::-1, ::-1]
+    return NewMap(readings.measurements.artifact.field, known, np.stack([field.real, field.imag]),
+                  Gain(rows.reshape(2 * n, -1), noise),
+                  np.tile(xy.sigma**2 / readings.weight, 2), of_plate, marks, xy.dof), seen
+
+
+def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewLines:
+    """Return the angular map, stage frame; nothing is known where no known line was read."""
+    angular, count = readings.problem.angular, readings.measurements.artifact.angular_count
+    known = plate.kept.lines()[0][1]
+    weight = np.where(known, angular.weight, 0.0)
+    view, line = np.nonzero(weight)
+    if not len(view):
+        return NewLines(np.full(count, np.nan), Gain(np.zeros((count, 0)), np.zeros((0, 0))),
+                        np.zeros((0, count)), theta.dof)
+    own = np.zeros((len(view), count))
+    own[np.arange(len(view)), line] = 1.0
+    columns, noise = readings.columns, np.diag(theta.sigma**2 / weight[view, line])
+    for at, values in zip(columns.lines.at, columns.lines.values, strict=True):
+        here = columns.size[at] * values[view, line]
+        noise += np.outer(here, here)
+    whole = noise + plate.kept.lines()[1][count:, count:][np.ix_(line, line)]
+    gain = line_gain(angular.turns, weight, whole)
+    found = gain.rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
+    found[~gain.rows.any(axis=1)] = np.nan
+    rows = gain.rows
+    if readings.measurements.sense is Sense.PLATE_MOVES:
+        back = -np.arange(count) % count
+        found, rows = -found[back], -rows[back]
+    return NewLines(found, Gain(rows, noise), own, theta.dof)
+
+
+def _misfit(seen: Seen, dof_noise: float) -> tuple[Finding, ...]:
+    """Return whether the residuals are larger than noise and plate allow, if there are any."""
+    touched = (seen.gain.rows[:seen.known.size] != 0).any(axis=1).sum()
+    dof = len(seen.rest) - (2 * int(touched) + len(seen.parameters) - 3)
+    if dof <= 0:
+        return ()
+    square = float(seen.rest @ np.linalg.solve(seen.gain.noise, seen.rest))
+    p = float(chdtrc(dof, square) if dof_noise >= MANY_DOF else fdtrc(dof, dof_noise, square / dof))
+    more = float(np.sqrt(square / dof))
+    return (Finding("plate_misfit", more, unit="m/m", p=p),) if p < F_LEVEL and more > SAME else ()
+
+
+def _error_map(readings: PlateReadings, new: NewMap, lines: NewLines, plate: KnownPlate,
+               parts: dict[str, np.ndarray]) -> ErrorMap:
+    """Return the map with its uncertainty; without scale unless a reference length sets it."""
+    artifact, known = new.artifact, new.known
+    xy = new.xy if plate.result.reference else new.without_scale(new.xy.reshape(-1)).reshape(
+        new.xy.shape)
+    variance = np.sum(list(parts.values()), axis=0).reshape(xy.shape)
+    (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan) for values in (xy, np.sqrt(variance)))
+    length = artifact.grid_pitch_m * max(artifact.half)
+    z = (artifact.x_m + 1j * artifact.y_m) / length
+    o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(gx + 1j * gy))
+    u_theta = np.where(np.isfinite(lines.values), np.sqrt(np.diag(lines.covariance(plate))),
+                       np.nan)
+    return ErrorMap(artifact, gx, gy, u_x, u_y, lines.values, u_theta, o / length, r / length,
+                    ThetaDatum.ZERO_MEAN)
+
+
+def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
+    """Return the noise with degrees of freedom and k of the map's uncertainty."""
+    before = plate.result.noise
+    dof = joint_dof((parts["reading noise"].mean(), noise.dof_xy),
+                    (parts["known plate"].mean(), before.dof_of("xy")),
+                    (parts["terms"].mean(), np.inf))
+    dof_theta = min(noise.dof_theta, before.dof_of("theta"))
+    return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
+                   k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
+
+
+def _views(readings: PlateReadings, seen: Seen) -> tuple[ViewResult, ...]:
+    problem, nan, out = readings.problem, float("nan"), []
+    for index, one in enumerate(readings.measurements.views):
+        phi = tx = ty = nan
+        if index in problem.grid.index:
+            row = problem.grid.index.index(index)
+            values = seen.parameters[3 * row:3 * row + 3]
+            turn = problem.grid.poses[row].phase * np.exp(1j * problem.turn_rad[row])
+            offset = turn * complex(*values[1:])
+            phi = float(values[0] / problem.half_width_m + problem.turn_rad[row])
+            tx, ty = offset.real, offset.imag
+        out.append(ViewResult(one.view.name, one.view.rotation_rad, *one.view.translation_m, phi,
+                              tx, ty, one.used, sum(one.rejected.values()),
+                              **weights_read(problem, index)))
+    return tuple(out)
+
+
+def _observability(seen: Seen) -> Observability:
+    """Return that of the marks that were read: what is known is determined."""
+    unknowns = 2 * int(seen.known.sum()) + len(seen.parameters)
+    return Observability(unknowns, unknowns, 0, True)
+
+
+def _term_results(options: Options, readings: PlateReadings) -> tuple[TermResult, ...]:
+    """Return the terms of the model; none is estimated."""
+    declared = {term.name for term in options.terms}
+    return tuple(TermResult(str(term.name), term.size, (), None, "declared" if term.name in declared
+                            else "default") for term in readings.problem.terms)
+
+
+def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
+            plate: KnownPlate) -> Iterator[BudgetLine]:
+    """Yield the lines of the budget: noise, known plate, terms; interpolation."""
+    noise, of_plate = result.noise, plate.result.artifact_map
+    u = {"reading noise": noise.sigma_xy, "terms": float("nan"),
+         "known plate": rms(np.stack([of_plate.u_ax, of_plate.u_ay]))}
+    kinds = {"reading noise": ("A", noise.dof_xy, "readings"), "terms": ("B", np.inf, "default"),
+             "known plate": ("A", plate.result.noise.dof_of("xy"), "declared")}
+    by = next((way for way in ("declared", "repeats")
+               if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy), "residuals")
+    for name, variance in parts.items():
+        (kind, dof, source), each = kinds[name], np.sqrt(variance)
+        details: dict[str, object] = {"plate": plate.where} if name != "reading noise" else {
+            "by": by, "contradicted": False}
+        yield BudgetLine("xy", name, kind, 0.0, u[name], "m", rms(each), float(each.max()), dof,
+                         source, details)
+    yield from (line for line in budget_lines(result)
+                if (line.quantity, line.component) == ("xy", INTERPOLATION))

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views of a known plate as generalised least squares (method eq. 13.1).
+
+The plate's error is known with a covariance, the same in all readings of a mark. So the readings
+less the known plate have the noise of the reading and that of the plate, and the map is the best
+linear estimate under the covariance of both together: dense, over all readings.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from selfcal_ros.errors import NotIdentifiableError, NotSettledError
+from selfcal_ros.estimation.joint.problem import Problem
+from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
+from selfcal_ros.estimation.lattice.connectivity import Gauge
+from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE
+from selfcal_ros.estimation.terms.columns import TermColumns
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.terms import OF_LINES, TermName
+
+MOST_STEPS = 50
+"""Most steps to the places of the stage and the rotations of the plate."""
+
+STILL = 1e-13
+"""Change of a reading, m, that is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """A linear estimate in its datum.
+
+    Attributes
+    ----------
+    rows : float array (q, r)
+        What the estimate makes of a unit of each reading.
+    noise : float array (r, r)
+        Covariance of the readings for which it is the best.
+    """
+
+    rows: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the estimate, (q, q)."""
+        return self.rows @ self.noise @ self.rows.T
+
+
+def least_squares(design: np.ndarray, noise: np.ndarray, held: np.ndarray,
+                  vague: float = 0.0) -> Gain:
+    """Return the generalised least squares with combinations `held` at 0.
+
+    Parameters
+    ----------
+    design : float array (r, q)
+        Readings for a unit of each unknown, but for the combinations held, which change none.
+    noise : float array (r, r)
+        Covariance of the readings.
+    held : float array (q, k)
+        Orthonormal combinations of the unknowns.
+    vague : float
+        Information on every unknown, relative to the mean.
+    """
+    root = np.linalg.cholesky(noise)
+    white = solve_triangular(root, design, lower=True)
+    normal = white.T @ white
+    size = np.trace(normal) / len(normal)
+    normal[np.diag_indices(len(normal))] += vague * size
+    half = np.linalg.solve(normal + size * held @ held.T, white.T)
+    return Gain(solve_triangular(root, half.T, lower=True, trans="T").T, noise)
+
+
+@dataclass(frozen=True, eq=False)
+class PlateReadings:
+    """Readings of known marks.
+
+    Attributes
+    ----------
+    measurements : Measurements
+        The readings.
+    problem : Problem
+        The same in the frame of the plate as it lies.
+    columns : TermColumns
+        Terms of the model.
+    at : tuple of int arrays (r,)
+        View, row and column of each reading of a known mark.
+    """
+
+    measurements: Measurements
+    problem: Problem
+    columns: TermColumns
+    at: tuple[np.ndarray, ...]
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Weight of each reading, (r,)."""
+        return self.problem.grid.weight[self.at]
+
+    def of_field(self) -> np.ndarray:
+        """Return the readings for a unit of the stage's error at each node, complex (r, n)."""
+        views, frames = self.problem.system.grid.views, self.problem.frames[self.at[0]]
+        n, nodes = views.z_sites.size, views.z_sites.shape
+        if isinstance(views, LatticeViews):
+            out = np.zeros((len(frames), n), dtype=complex)
+            out[np.arange(len(frames)), views.site_index[self.at]] = (
+                frames * views.phases.conj()[self.at[0]])
+            return out
+        fields = views.gather(np.eye(n, dtype=complex).reshape(n, *nodes))
+        return frames[:, None] * fields[(slice(None), *self.at)].T
+
+    def of_misalignments(self) -> np.ndarray:
+        """Return the readings for a unit of phi, Re tau, Im tau of each view, complex (r, 3 v)."""
+        grid = self.problem.system.grid
+        out = np.zeros((len(self.at[0]), 3 * grid.n_views), dtype=complex)
+        each = np.arange(len(out))
+        for part, shape in enumerate((grid.views.z[self.at[1:]] * 1j, 1.0, 1j)):
+            out[each, 3 * self.at[0] + part] = shape
+        return out
+
+    def of_terms(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the terms of the marks make of the readings, (r, p), and their sizes, (p,).
+
+        But for the microscope's.
+        """
+        mine = [i for i, column in enumerate(self.columns.columns)
+                if column.term not in (TermName.MICROSCOPE, *OF_LINES)]
+        view, row, column = self.at
+        return self.columns.grid[mine][:, view, row, column].T, self.columns.size[mine]
+
+    def of_microscope(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the readings for a unit of each of its coefficients, (r, 4), and their sizes."""
+        out, size = np.zeros((len(self.at[0]), 4), dtype=complex), np.zeros(4)
+        for i, column in enumerate(self.columns.columns):
+            if column.term == TermName.MICROSCOPE:
+                part = MICROSCOPE_PARTS.index(column.component)
+                out[:, part], size[part] = self.columns.grid[(i, *self.at)], column.size
+        return out, size
+
+    def of_marks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return which marks were read, bool (nx, ny), and the readings for a unit of Ax, Ay."""
+        marks = np.zeros(self.problem.grid.weight.shape[1:], dtype=bool)
+        marks[self.at[1:]] = True
+        number = (np.cumsum(marks) - 1).reshape(marks.shape)[self.at[1:]]
+        own = np.zeros((len(number), int(marks.sum())), dtype=complex)
+        own[np.arange(len(number)), number] = 1.0
+        return marks, complex_design(own)
+
+
+def stacked(values: np.ndarray) -> np.ndarray:
+    """Return complex rows (r, ...) as real ones, (2 r, ...): x, then y."""
+    return np.concatenate([values.real, values.imag])
+
+
+def complex_design(values: np.ndarray) -> np.ndarray:
+    """Return a matrix (r, n) between complex numbers as one between their parts, (2 r, 2 n)."""
+    return np.block([[values.real, -values.imag], [values.imag, values.real]])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The map of the stage in views of a known plate, frame of the equations.
+
+    Attributes
+    ----------
+    known : bool array (nx, ny)
+        Nodes that are known.
+    field : complex array (nx, ny)
+        Their error, no translation and rotation, m; 0 elsewhere.
+    parameters : float array (3 views,)
+        Misalignments as in `NormalEquations`, m.
+    gain : Gain
+        Of all nodes, x then y, and the misalignments, m.
+    rest : float array (2 r,)
+        Residuals.
+    """
+
+    known: np.ndarray
+    field: np.ndarray
+    parameters: np.ndarray
+    gain: Gain
+    rest: np.ndarray
+
+
+def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
+               microscope: np.ndarray) -> Seen:
+    """Return the map of the stage for a covariance of the readings.
+
+    Parameters
+    ----------
+    readings : PlateReadings
+        The readings.
+    noise : float array (2 r, 2 r)
+        Covariance of the readings less what is known, m^2.
+    plate : complex array (r,)
+        Known error of the plate, m.
+    microscope : complex array (r,)
+        Known effect of the microscope, m.
+
+    Raises
+    ------
+    NotIdentifiableError
+        If less than half of the nodes near the readings are known.
+    NotSettledError
+        If the rotations of the plate do not converge.
+    """
+    views = readings.problem.system.grid.views
+    fields = readings.of_field()
+    design = np.hstack([complex_design(fields), stacked(readings.of_misalignments())])
+    touched = (np.abs(fields) > 0).any(axis=0).reshape(views.z_sites.shape)
+    placed = not isinstance(views, LatticeViews)
+    known, z = touched, views.z_sites
+    if placed:
+        known = touched & (np.maximum(abs(z.real), abs(z.imag)) < CORE)
+    columns = np.concatenate([np.tile(touched.ravel(), 2), np.ones(
+        design.shape[1] - 2 * z.size, dtype=bool)])
+    spread = np.tile(1 / readings.weight, 2)
+    for last in (False, False, True) if placed else (True,):
+        if known.sum() < 3 or (last and known.sum() < touched.sum() / 2):
+            left = int((~known).sum())
+            raise NotIdentifiableError(
+                f"a view of the known plate that leaves {left} of {known.size} nodes of the map "
+                "unknown: measure more of its marks", Observability(
+                    2 * int(known.sum()), 2 * known.size, 2 * left, False))
+        gain = _in_datum(design, noise, z, known, columns, VAGUE * placed)
+        if not last:
+            u2 = (gain.rows[:2 * z.size] ** 2 @ spread).reshape(2, *z.shape)
+            known = touched & (u2 < KNOWN**2).all(axis=0)
+    return _converged(readings, design, gain, known, known_parts=(plate, microscope))
+
+
+def _in_datum(design: np.ndarray, noise: np.ndarray, z: np.ndarray, known: np.ndarray,
+              columns: np.ndarray, vague: float) -> Gain:
+    """Return the estimate of all unknowns: no translation, no rotation over the known nodes."""
+    basis = np.zeros((design.shape[1], 3))
+    basis[:2 * z.size] = stacked(Gauge(z, known, scale=False).orthonormal)
+    found = least_squares(design[:, columns], noise, basis[columns], vague)
+    rows = np.zeros((design.shape[1], len(noise)))
+    rows[columns] = found.rows
+    return Gain(rows, noise)
+
+
+def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: np.ndarray, *,
+               known_parts: tuple[np.ndarray, np.ndarray]) -> Seen:
+    """Return the solution with finite rotations, at the places of the stage (Gauss-Newton)."""
+    problem, at, (plate, microscope) = readings.problem, readings.at, known_parts
+    n, marks = known.size, problem.system.grid.views.z[at[1:]] * problem.half_width_m
+    places = problem.places if problem.moves else None
+    y, moved = problem.grid.y[at] - plate - microscope, None
+    taken = np.zeros(len(y), dtype=complex)
+    for _ in range(MOST_STEPS):
+        right = stacked(y - taken)
+        found = gain.rows @ right
+        field = np.where(known, (found[:n] + 1j * found[n:2 * n]).reshape(known.shape), 0.0)
+        phi = found[2 * n::3][at[0]] / problem.half_width_m
+        turn, before = np.expm1(1j * phi), taken
+        taken = np.zeros(len(plate), dtype=complex)
+        if problem.rigid:
+            taken = (turn - 1j * phi) * marks + turn * plate
+        if places is not None:
+            near = None if moved is None else places.errors(field, moved)
+            moved = places.moved(field, near)
+            taken = taken + places.changes(moved, problem.turn_rad)[at]
+        if np.abs(taken - before).max() <= STILL:
+            return Seen(known, field, found[2 * n:], gain, right - design @ found)
+    raise NotSettledError("recheck", "the rotations of the plate do not settle",
+                          "check the readings for misalignments of more than a few degrees")
+
+
+def line_gain(turns: Sequence[int], weight: np.ndarray, noise: np.ndarray) -> Gain:
+    """Return the estimate of the angular map from lines of a known plate, its mean 0.
+
+    Parameters
+    ----------
+    turns : sequence of int
+        Turn of each view in lines.
+    weight : float array (views, K)
+        Weight of each reading; 0 = not read.
+    noise : float array (r, r)
+        Covariance of the readings of weight > 0, in their order, less the known plate.
+    """
+    view, line = np.nonzero(weight)
+    count = weight.shape[1]
+    site = (line + np.array(turns, dtype=int)[view]) % count
+    told = np.unique(site)
+    design = np.zeros((len(view), len(told) + len(turns)))
+    design[np.arange(len(view)), np.searchsorted(told, site)] = 1
+    design[np.arange(len(view)), len(told) + view] = 1
+    held = np.zeros((design.shape[1], 1))
+    held[:len(told)] = 1 / np.sqrt(len(told))
+    found = least_squares(design, noise, held)
+    rows = np.zeros((count, len(view)))
+    rows[told] = found.rows[:len(told)]
+    return Gain(rows, noise)

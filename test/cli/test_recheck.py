@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal recheck``: what it prints, writes and refuses."""
+
+import json
+
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.files import read_json
+
+PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}
+SEEDS = {"seed": 3, "truth": {"phi": 1e-4, "t": 1e-5},
+         "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-6}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A calibration, a view of its stage, one of a stage that has changed, and the result."""
+    folder = tmp_path_factory.mktemp("recheck")
+    first = [{"name": "identity"}, {"name": "rot90", "rotation_deg": 90},
+             {"name": "line", "rotation_deg": 45, "grid": False},
+             {"name": "shift_x", "translation_pitch": [1, 0]}]
+    for name, views, more in (
+            ("first", first, {"noise_seed": 1}),
+            ("same", [{"name": "again"}], {"noise_seed": 2}),
+            ("bent", [{"name": "again"}], {"noise_seed": 2, "physics": {"stage_bend": 2e-7}})):
+        spec = SEEDS | more | {"plan": PLAN | {"views": views, "plan_id": name}}
+        (folder / f"{name}.yaml").write_text(json.dumps(spec))  # YAML, too
+        assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
+    assert main(["solve", str(folder / "first"), "-o", str(folder / "r.json"), "--quiet"]) == 0
+    return folder
+
+
+def test_a_stage_that_is_as_it_was(folder, capsys):
+    out = folder / "same.json"
+    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", str(out),
+                 "--budget"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("Still good: no change since r.json beyond its uncertainty (p = ")
+    assert "change since" in text and "against the plate (k=1)" in text
+    assert "theta  most at line" in text
+    assert f"covariance of the plate's map in {folder / 'r.json'}" in text
+    data = read_json(out)
+    found = data["recheck"]
+    assert found["changed"] is False and found["p"] > 0.05
+    assert found["of"] == str(folder / "r.json")
+    assert found["largest"]["u"] > 0 and data["verdict"]["qualified"] is True
+    assert data["warnings"] == []
+    assert main(["diff", str(folder / "r.json"), str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["significance_xy"]["correlated"] is False
+
+
+def test_a_stage_that_has_changed(folder, capsys):
+    out = folder / "bent.json"
+    assert main(["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out),
+                 "--report", str(folder / "bent.html")]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("Changed since r.json: calibrate anew; most at x = ")
+    data = read_json(out)
+    assert data["recheck"]["changed"] is True and data["recheck"]["p"] < 1e-3
+    assert data["warnings"][0].startswith("Changed since r.json")
+    assert abs(data["recheck"]["largest"]["change"]) > 3 * data["recheck"]["largest"]["u"]
+    assert "Changed since r.json" in (folder / "bent.html").read_text()
+
+
+@pytest.mark.parametrize("option", ["--validate", "--robust"])
+def test_options_that_need_more_than_one_view(option, folder, capsys):
+    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), option]) == 2
+    assert f"{option}: the plate is known from {folder / 'r.json'}" in capsys.readouterr().err
+
+
+def test_a_recheck_knows_no_plate(folder, capsys):
+    out = str(folder / "again.json")
+    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", out]) == 0
+    assert main(["recheck", out, str(folder / "same")]) == 2
+    assert "a recheck itself" in capsys.readouterr().err

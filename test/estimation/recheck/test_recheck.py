@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recheck against one dense least squares of both sessions, and what it refuses."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint import solve
+from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.recheck.known import known_plate
+from selfcal_ros.estimation.recheck.solve import recheck
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense, subset
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.model.view import Plan, View
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.machine import Spread, random_truth
+from selfcal_ros.simulation.truth import simulate_measurements
+from test.support import placed
+from test.support.lattice_plans import plan_of
+from test.support.options import BARE, bare
+from test.support.two_sessions import MICROSCOPE, TwoSessions
+
+PITCH = 0.01
+QUIET = {"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "stop_sigma_m": 20e-6}
+MODELS = {"none": "", "microscope": "microscope:0.01:0.01:0.002"}
+
+
+@pytest.fixture(autouse=True)
+def _equal_white_noise(monkeypatch):
+    """What else noise may be enlarges both maps alike (`Together`)."""
+    monkeypatch.setattr(solve, "MAX_SITES", 0)
+
+
+def linear(model="none"):
+    return replace(bare(causes=False, at_places=False, misalignment_model=(
+        "linear" if model == "none" else "rigid")), assumed=parse_terms([MODELS[model]], ""))
+
+
+def saved(result):
+    return result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
+
+
+def one_view(artifact, q=0, a=0, b=0, degrees=0.0):
+    turn = q * np.pi / 2 + np.radians(degrees)
+    return Plan("again", artifact, (View("again", turn, (a * PITCH, b * PITCH), True,
+                                         artifact.angular_count > 0 and not degrees),))
+
+
+@cache
+def sessions(sense=Sense.MICROSCOPE_MOVES, pose=(0, 0, 0), microscope=False):
+    """Readings of a calibration on the lattice, and of a view of a stage that has changed."""
+    plan, rng = plan_of("0,90,tx", Artifact(5, PITCH, 8), lines=1), np.random.default_rng(5)
+    truth = random_truth(plan.artifact, len(plan.views), rng, Spread(
+        phi_rad=1e-5, microscope_scale=4e-3 * microscope,
+        microscope_shear=5e-4 * microscope))
+    changed = replace(truth, g=truth.g + rng.normal(0, 3e-8, truth.g.shape))
+    settings = CellSettings(sense, 20e-9, 2e-6, **QUIET)
+    return tuple(simulate_measurements(one, its, rng, visits=True, settings=settings)
+                 for one, its in ((truth, plan), (changed, one_view(plan.artifact, *pose))))
+
+
+def require_same(result, wanted, *, rel=1e-5):
+    """Require map, change and their covariances as one least squares has them."""
+    emap, found = result.error_map, result.extra["recheck"]
+    for rows, values, u in (
+            (wanted.after, (emap.gx, emap.gy), (emap.u_gx, emap.u_gy)),
+            (wanted.change, (found["dx"], found["dy"]), (found["u_dx"], found["u_dy"]))):
+        of, spread = wanted.of(rows)
+        assert np.ravel(u)[wanted.known] == pytest.approx(spread, rel=rel)
+        assert np.abs(np.ravel(values)[wanted.known] - of).max() < rel * spread.min()
+        assert np.isnan(np.ravel(values)[~wanted.known]).all()
+    chi2, dof = wanted.chi2
+    test = found["significance_xy"]
+    assert test["dof"] == dof
+    assert test["chi2_ratio"] == pytest.approx(chi2 / dof, rel=100 * rel)
+    if wanted.K:
+        for rows, value, u in ((wanted.after_theta, emap.g_theta, emap.u_g_theta),
+                               (wanted.change_theta, found["d_theta"], found["u_d_theta"])):
+            of, spread = wanted.of(rows)
+            assert u == pytest.approx(spread, rel=rel)
+            assert np.abs(value - of).max() < rel * spread.min()
+    u = np.linalg.norm(wanted.scale)
+    assert found["scale"]["change"] == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
+    assert found["scale"]["u"] == pytest.approx(u, rel=rel)
+
+
+@pytest.mark.parametrize("sense", Sense)
+@pytest.mark.parametrize("pose", [(0, 0, 0), (2, 0, 0), (3, 0, 0)])
+@pytest.mark.parametrize("model", MODELS)
+def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(model, pose, sense):
+    before, after = sessions(sense, pose, model == "microscope")
+    first = saved(calibrate(before, linear(model)))
+    result = recheck(after, linear(model), known_plate(first, "r.json"))
+    grid = placed.plate(5, 5, "bilinear", angular_count=8)
+    require_same(result, TwoSessions(before, after, grid, first.noise.sigma_xy,
+                                     MICROSCOPE if model == "microscope" else (),
+                                     sigma_theta=first.noise.sigma_theta),
+                 rel=1e-5 if model == "none" else 1e-2)
+
+
+def general(pose, sigma=20e-9, seed=3, change=0.0):
+    """Readings of six general views, and of one more of a changed stage."""
+    rng, artifact = np.random.default_rng(seed), placed.plate(7, 5)
+    before, truth = placed.readings(artifact, placed.SIX, rng, linear=True, sigma=sigma)
+    field = truth.field + change * rng.normal(size=truth.field.shape)
+
+    def stage(at):
+        return placed.rows(artifact, np.ravel(at)) @ field.ravel()
+
+    after, other = placed.readings(artifact, [pose], rng, linear=True, sigma=sigma,
+                                   stage=lambda at: stage(at).reshape(np.shape(at)))
+    # of the same plate
+    view, = after.views
+    inside = view.view.pose.in_field(artifact)
+    moved = np.exp(1j * view.view.rotation_rad) * (truth.plate - other.plate)[inside]
+    return before, replace(after, views=(replace(
+        view, dx=view.dx + moved.real, dy=view.dy + moved.imag),))
+
+
+@pytest.mark.parametrize("pose", [(0, (0, 0)), (4, (0.1, -0.1)), (90, (0.5, 0.5))])
+def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose):
+    before, after = general(pose, change=3e-8)
+    first = saved(calibrate(before, linear()))
+    result = recheck(after, linear(), known_plate(first, "r.json"))
+    assert result.error_map.valid.sum() >= 15
+    assert result.verdict.qualified
+    require_same(result, TwoSessions(before, after, before.artifact, first.noise.sigma_xy,
+                                     known=result.error_map.valid), rel=1e-4)
+
+
+@cache
+def calibrated():
+    return saved(calibrate(sessions()[0], linear()))
+
+
+def test_terms_with_sizes_are_part_of_the_noise():
+    """Strain of the plate in this view is not to be told from the map's own first-order terms."""
+    _, after = sessions()
+    plate, size = known_plate(calibrated(), "r.json"), 2e-6
+    plain = recheck(after, linear(), plate)
+    strained = recheck(after, replace(linear(), terms=parse_terms([f"plate_strain:{size}"], "")),
+                       plate)
+    x, y = plain.artifact.x_m, plain.artifact.y_m
+    both = np.hypot(x, y) * size  # stretch and shear; a scale is no part of the map
+    for name in ("u_gx", "u_gy"):
+        u, more = (getattr(result.error_map, name) for result in (plain, strained))
+        assert more == pytest.approx(np.hypot(u, both), rel=1e-6)
+    more = strained.extra["recheck"]["scale"]["u"]
+    assert more == pytest.approx(np.hypot(plain.extra["recheck"]["scale"]["u"], size), rel=1e-6)
+    np.testing.assert_allclose(strained.error_map.gx, plain.error_map.gx, atol=1e-15)
+    assert [line.component for line in strained.budget] == [
+        "reading noise", "known plate", "terms", "interpolation"]
+
+
+def test_the_noise_is_that_of_many_repeats_or_of_the_calibration():
+    _, after = sessions()
+    plate = known_plate(calibrated(), "r.json")
+    assert recheck(after, linear(), plate).noise.sigma_xy == plate.result.noise.sigma_xy
+    view = after.views[0]
+    for dof, sigma in ((29, plate.result.noise.sigma_xy), (30, 5e-8)):
+        more = replace(after, views=(replace(view, sigma_xy=5e-8, dof_xy=dof, visits=None),))
+        assert recheck(more, linear(), plate).noise.sigma_xy == pytest.approx(sigma)
+
+
+def test_marks_and_lines_that_are_missing_are_unknown():
+    _, after = sessions()
+    view = after.views[0]
+    kept, lines = view.m > -2, view.k > 1
+    fewer = replace(after, views=(subset(view, kept, lines),))
+    result = recheck(fewer, linear(), known_plate(calibrated(), "r.json"))
+    np.testing.assert_array_equal(result.error_map.valid, np.tile(
+        np.arange(-2, 3)[:, None] > -2, 5))
+    np.testing.assert_array_equal(np.isfinite(result.error_map.g_theta), np.arange(8) > 1)
+    assert abs(np.nansum(result.error_map.gx)) < 1e-15
+    assert np.nansum(result.error_map.g_theta) == pytest.approx(0, abs=1e-15)
+
+
+def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
+    _, after = general((0, (0, 0)))
+    with pytest.raises(InputError, match="its plate has 5 x 5 marks 10 mm apart and 8 lines, the "
+                                         "one that was read 7 x 7 marks 10 mm apart and 0 lines"):
+        recheck(after, linear(), known_plate(calibrated(), "r.json"))
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "its plate is not known; calibrate anew"),
+    ({"method": "law"}, "the covariance of its plate is not kept"),
+    ({"extra": {"recheck": {"of": "first.json"}}}, "it has no plate of its own; name the "
+                                                   "calibration it was made with, first.json")])
+def test_results_without_a_known_plate(change, message):
+    with pytest.raises(InputError, match=f"r.json: .*{message}"):
+        known_plate(replace(calibrated(), **change), "r.json")
+
+
+def test_what_one_view_cannot_tell_is_refused():
+    plate, (_, after) = known_plate(calibrated(), "r.json"), sessions()
+    with pytest.raises(InputError, match=r"'drift' has no size, .* give it one, drift:SIZE"):
+        recheck(after, replace(linear(), terms=parse_terms(["drift"], "")), plate)
+    for options in (replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)),
+                    Options(method="law")):
+        with pytest.raises(InputError, match="a recheck has the method joint"):
+            recheck(after, options, plate)
+    nothing = replace(after, views=(replace(after.views[0], m=np.zeros(0, int), n=np.zeros(0, int),
+                                            dx=np.zeros(0), dy=np.zeros(0),
+                                            count=np.zeros(0, int), visits=None),))
+    with pytest.raises(NoDataError, match="no known mark was read"):
+        recheck(nothing, linear(), plate)
+    before, few = general((0, (3.2, 3.1)))
+    with pytest.raises(NotIdentifiableError, match=r"leaves .* of 25 nodes of the map unknown"):
+        recheck(few, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+
+
+def test_another_plate_does_not_fit_a_map_with_fewer_nodes_than_marks():
+    before, after = general((0, (0, 0)))
+    plate = known_plate(saved(calibrate(before, linear())), "r.json")
+    assert recheck(after, linear(), plate).verdict.grade is Grade.GOOD
+    rng, view = np.random.default_rng(1), after.views[0]
+    other = replace(after, views=(replace(view, dx=view.dx + rng.normal(0, 3e-7, len(view.m))),))
+    result = worded(recheck(other, linear(), plate))
+    assert result.verdict.grade is Grade.NOT_QUALIFIED
+    assert "times what the noise and the known plate allow" in result.verdict.sentence
+
+
+def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
+    """With visits and a smooth stage; the plate lies 0.5 mm beside, the stage follows the marks."""
+    artifact = Artifact(7, PITCH)
+    plan, rng = plan_of("0,90,tx", artifact), np.random.default_rng(2)
+    truth = random_truth(artifact, 3, rng, Spread(correlation_pitches=5.0, t_m=0, phi_rad=1e-3,
+                                                  g_m=2e-6))
+    settings = CellSettings(sigma_xy_m=5e-9, follow_mark=True, **(QUIET | {"stop_sigma_m": 0}))
+    first = saved(calibrate(simulate_measurements(truth, plan, rng, visits=True,
+                                                  settings=settings), BARE))
+    beside = replace(truth, t_m=np.array([[5e-4, -4e-4]]), phi_rad=truth.phi_rad[:1])
+    after = simulate_measurements(beside, one_view(artifact), rng, visits=True, settings=settings)
+    plate = known_plate(first, "r.json")
+    found = recheck(after, BARE, plate).extra["recheck"]
+    assert not found["changed"]
+    at_sites = recheck(after, replace(BARE, at_places=False), plate).extra["recheck"]
+    assert at_sites["changed"] and at_sites["rms"] > 1.5 * found["rms"]
