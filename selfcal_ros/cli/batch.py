@@ -14,6 +14,7 @@ from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, p
 
 if TYPE_CHECKING:
     from selfcal_ros.batch.folder import Job, Record, Settings
+    from selfcal_ros.model.result import CalibrationResult
 
 HELP = "calibrate from many bags on all cores: one table, trends and changes over time"
 LOCAL = "local"
@@ -33,6 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                      help="use a dask.distributed cluster: address of its scheduler, with access "
                      "to the same files, or 'local' (default) for one started for this run")
     parser.add_argument("--redo", action="store_true", help="solve all bags again")
+    parser.add_argument("--baseline", metavar="RESULT.json",
+                        help="test every map against this one, and name those that differ")
     add_json(parser, "the content of batch.json instead of a summary")
     add_options(parser)
 
@@ -49,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
+    baseline = _baseline(args.baseline)
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
@@ -71,8 +75,13 @@ def run(args: argparse.Namespace) -> int:
         records = [done[index] for index in sorted(done)]
         keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
         before = sum("key" in record and record["key"] in keys for record in records)
+        if baseline is not None:
+            from selfcal_ros.batch.baseline import compared, sentence
+
+            records = compared(records, folder, baseline, args.baseline)
         found = series_of(records)
         lines = summary_lines(records, found, before)
+        lines += [sentence(records, args.baseline)] if baseline is not None else []
         content = batch_json(records, found, before)
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))
@@ -80,6 +89,16 @@ def run(args: argparse.Namespace) -> int:
     say(args, "\n".join([*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, "
                          "batch.json"]), content)
     return exit_code(records)
+
+
+def _baseline(file: str | None) -> "CalibrationResult | None":
+    """Return the map to compare with, None if there is none to be."""
+    if file is None:
+        return None
+    from selfcal_ros.files import read_json
+    from selfcal_ros.model.result import result_from_dict
+
+    return result_from_dict(read_json(file), file)
 
 
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
