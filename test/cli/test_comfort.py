@@ -267,7 +267,7 @@ RUNS = {
     "solve": "solve BAG -o s.json", "batch": "batch BAG -o batch", "diff": "diff S S",
     "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
     "table": "table R -o t.csv", "combine": "combine R t.csv -o mean.json",
-    "certificate": "certificate R DETAILS -o c.xml",
+    "certificate": "certificate R DETAILS -o c.xml", "iso230": "iso230 R",
     "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",

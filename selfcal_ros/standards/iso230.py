@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of ISO 230 from a map and the repeats behind it: parts 2 (axes), 4 (circles), 6.
+
+ISO 230 counts deviations as actual minus commanded position, x = -G. Uncertainties are the rms of
+draws from the covariance of the map and from the scatter of the repeats, about the figure itself.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.apply import StageMap
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+
+DRAWS = 2000
+"""Draws behind the uncertainties: 1.6 % standard error."""
+CIRCLE_POINTS = 72
+"""Points of a circle."""
+FEWEST = 3
+"""Smallest number of positions along an axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Repeats at one site, approached along one axis in both directions.
+
+    Attributes
+    ----------
+    reversal_m : float
+        Mean stage error after a positive approach minus that after a negative one.
+    u_reversal_m : float
+        Its standard deviation for unit scatter of one approach.
+    s_up_m, s_down_m : float
+        Standard deviation of one approach in each direction.
+    dof_up, dof_down : int
+        Their degrees of freedom.
+    mean_sign : float
+        Mean sign of all approaches: +1 if all were positive.
+    """
+
+    reversal_m: float
+    u_reversal_m: float
+    s_up_m: float
+    s_down_m: float
+    dof_up: int
+    dof_down: int
+    mean_sign: float
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of a standard with its standard uncertainty, m."""
+
+    value: float
+    u: float
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFigures:
+    """Figures of an axis, ISO 230-2, along a line of sites.
+
+    Attributes
+    ----------
+    axis : str
+        ``x`` or ``y``.
+    line_m : float
+        The other coordinate of the line.
+    position_m, up_m, down_m, s_up_m, s_down_m : float array (n,)
+        Positions, mean deviations and standard deviations by approach; a map without repeats
+        has the mean deviation in `up_m` and `down_m`, and NaN for the others.
+    approaches : tuple of int
+        Smallest number of approaches behind a standard deviation, positive and negative.
+    figures : dict of Figure
+        By the symbols of the standard: ``M``, and with repeats ``E``, ``B``, ``R``, ``A``
+        and those of one direction, ``E+``, ``R-`` ...
+    """
+
+    axis: str
+    line_m: float
+    position_m: np.ndarray
+    up_m: np.ndarray
+    down_m: np.ndarray
+    s_up_m: np.ndarray
+    s_down_m: np.ndarray
+    approaches: tuple[int, int]
+    figures: dict[str, Figure]
+
+
+def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Scatter]:
+    """Return the repeats at each site of the lattice that was approached from both sides.
+
+    Only differences within a view and mark count: what the plate and the views do is in the map.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Readings with their visits.
+    axis : int
+        0 = x, 1 = y.
+
+    Raises
+    ------
+    InputError
+        If the map has nodes of its own.
+    """
+    if measurements.artifact.map_grid is not None:
+        raise InputError("iso230", "the map has nodes of its own, off the marks",
+                         "give its RESULT.json: figures without repeats")
+    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+    groups: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
+    for view in measurements.views:
+        for site, group in _groups(view, measurements, axis, sign):
+            groups.setdefault(site, []).append(group)
+    found = {site: _scatter(parts) for site, parts in groups.items()}
+    return {site: item for site, item in found.items() if item is not None}
+
+
+def _groups(view: ViewReadings, measurements: Measurements, axis: int,
+            sign: int) -> Iterator[tuple[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
+    """Yield the site of each mark with stage errors and signs of approach of its visits."""
+    visits = view.visits
+    if visits is None or not len(visits.mark):
+        return
+    x, y = view.view.lattice_pose(measurements.artifact).site_of(view.m, view.n)
+    values = sign * (visits.dx, visits.dy)[axis]
+    approach = (visits.approach_x, visits.approach_y)[axis]
+    order = np.argsort(visits.mark, kind="stable")
+    starts = np.flatnonzero(np.diff(visits.mark[order], prepend=-1))
+    for rows in np.split(order, starts[1:]):
+        mark = visits.mark[rows[0]]
+        yield (sign * int(x[mark]), sign * int(y[mark])), (values[rows], approach[rows])
+
+
+def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
+    """Return the pooled repeats of a site; None if a direction has none, or no second one."""
+    weight = moved = 0.0
+    square, dof = np.zeros(2), np.zeros(2, dtype=int)
+    signs = np.concatenate([approach for _, approach in parts])
+    for values, approach in parts:
+        means, counts = np.zeros(2), np.zeros(2, dtype=int)
+        for side, wanted in enumerate((1, -1)):
+            of = values[approach == wanted]
+            counts[side] = len(of)
+            if len(of):
+                means[side] = of.mean()
+                square[side] += ((of - of.mean()) ** 2).sum()
+                dof[side] += len(of) - 1
+        if counts.all():
+            w = 1 / (1 / counts).sum()
+            weight, moved = weight + w, moved + w * (means[0] - means[1])
+    if not weight or not dof.all():
+        return None
+    s = np.sqrt(square / dof)
+    return Scatter(float(moved / weight), float(1 / np.sqrt(weight)), float(s[0]), float(s[1]),
+                   int(dof[0]), int(dof[1]), float(signs.mean()))
+
+
+def bidirectional(up: np.ndarray, down: np.ndarray, s_up: np.ndarray,
+                  s_down: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the figures of ISO 230-2, clause 3, over the last axis of the arrays.
+
+    Parameters
+    ----------
+    up, down, s_up, s_down : float array (..., n)
+        Mean deviation and standard deviation at each position, by direction of approach.
+    """
+    def spread(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+        return high.max(axis=-1) - low.min(axis=-1)
+
+    reversal = up - down
+    both = np.maximum(2 * s_up + 2 * s_down + np.abs(reversal), np.maximum(4 * s_up, 4 * s_down))
+    high = np.maximum(up + 2 * s_up, down + 2 * s_down)
+    low = np.minimum(up - 2 * s_up, down - 2 * s_down)
+    return {
+        "M": spread((up + down) / 2, (up + down) / 2), "B": np.abs(reversal).max(axis=-1),
+        "mean B": reversal.mean(axis=-1), "E": spread(np.maximum(up, down), np.minimum(up, down)),
+        "E+": spread(up, up), "E-": spread(down, down), "R": both.max(axis=-1),
+        "R+": 4 * s_up.max(axis=-1), "R-": 4 * s_down.max(axis=-1), "A": spread(high, low),
+        "A+": spread(up + 2 * s_up, up - 2 * s_up),
+        "A-": spread(down + 2 * s_down, down - 2 * s_down)}
+
+
+def axis_figures(stage: StageMap, axis: int, line: int,
+                 repeats: dict[tuple[int, int], Scatter] | None = None, *,
+                 approach_in_model: bool = False) -> AxisFigures:
+    """Return the figures of an axis along a line of sites.
+
+    Parameters
+    ----------
+    stage : StageMap
+        The map.
+    axis, line : int
+        0 = x, 1 = y; index of the line, 0 = through the centre of the field.
+    repeats : dict, optional
+        As `scatters` returns; None = figures of the mean deviation alone.
+    approach_in_model : bool
+        Whether the map is that of the mean of both approaches already (term `approach`).
+
+    Raises
+    ------
+    InputError
+        If the line has fewer than three positions.
+    """
+    known = _positions(stage, axis, line, repeats)
+    at, emap = stage.error_map.artifact, stage.error_map
+    index = np.array(known) + at.half
+    place = index[:, 0], index[:, 1]
+    error = (emap.gx, emap.gy)[axis][place]
+    drawn = error + _map_draws(stage, place, axis)
+    position = np.array([site[axis] for site in known]) * at.grid_pitch_m
+    nothing = np.full(len(known), np.nan)
+    if repeats is None:
+        value = -error
+        whole = float(np.ptp(value))
+        return AxisFigures("xy"[axis], line * at.grid_pitch_m, position, value, value, nothing,
+                           nothing, (0, 0), {
+                               "M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
+    items = [repeats[site] for site in known]
+    s_up, s_down, reversal, u_reversal, dof_up, dof_down, sign = (
+        np.array([getattr(item, name) for item in items]) for name in (
+            "s_up_m", "s_down_m", "reversal_m", "u_reversal_m", "dof_up", "dof_down", "mean_sign"))
+    shift = np.zeros(len(known)) if approach_in_model else sign * reversal / 2
+    up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
+    rng = np.random.default_rng(0)
+    size = (DRAWS, len(known))
+    turned = reversal + rng.standard_normal(size) * u_reversal * np.sqrt(
+        (s_up**2 + s_down**2) / 2)
+    draws = bidirectional(
+        -(drawn - shift + turned / 2), -(drawn - shift - turned / 2),
+        s_up * np.sqrt(rng.chisquare(dof_up, size) / dof_up),
+        s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down))
+    found = bidirectional(up, down, s_up, s_down)
+    return AxisFigures(
+        "xy"[axis], line * at.grid_pitch_m, position, up, down, s_up, s_down,
+        (int(dof_up.min()) + 1, int(dof_down.min()) + 1),
+        {name: Figure(float(value), _rms_about(draws[name], float(value)))
+         for name, value in found.items()})
+
+
+def _positions(stage: StageMap, axis: int, line: int,
+               repeats: dict[tuple[int, int], Scatter] | None) -> list[tuple[int, int]]:
+    """Return the known sites along a line, with repeats if there are some."""
+    at, valid = stage.error_map.artifact, stage.error_map.valid
+    half = at.half[axis]
+    sites = [(i, line) if axis == 0 else (line, i) for i in range(-half, half + 1)]
+    known = [site for site in sites if abs(line) <= at.half[1 - axis]
+             and valid[site[0] + at.half[0], site[1] + at.half[1]]
+             and (repeats is None or site in repeats)]
+    if len(known) < FEWEST:
+        raise InputError(
+            f"line {line} along {'xy'[axis]}", f"{len(known)} positions "
+            + ("are known" if repeats is None else "were approached at least twice from each "
+               "side in one view"),
+            "choose another line" if repeats is None else "measure with visit_order "
+            "there_and_back, or x_back_y_back for both axes, and repeats 4 or more")
+    return known
+
+
+def _rms_about(values: np.ndarray, centre: float) -> float:
+    return float(np.sqrt(np.mean((values - centre) ** 2)))
+
+
+def _map_draws(stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int) -> np.ndarray:
+    """Return draws of the error of the map at sites along one axis, (DRAWS, n), m."""
+    emap = stage.error_map
+    chosen = np.zeros(emap.artifact.shape, dtype=bool)
+    chosen[place] = True
+    cover, is_full = xy_covariance(stage.result, chosen)
+    n = int(chosen.sum())
+    part = slice(axis * n, (axis + 1) * n)
+    own = cover[part, part] if is_full else np.diag(cover[part])
+    order = np.argsort(np.ravel_multi_index(place, emap.artifact.shape))
+    out = np.empty((DRAWS, n))
+    out[:, order] = _draws(own)
+    return out
+
+
+def _draws(cover: np.ndarray) -> np.ndarray:
+    """Return draws with a covariance; zeros where it is not known."""
+    if not np.isfinite(cover).all():
+        return np.full((DRAWS, len(cover)), np.nan)
+    values, vectors = np.linalg.eigh(cover)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.random.default_rng(1).standard_normal((DRAWS, len(cover))) @ root.T
+
+
+@dataclass(frozen=True, eq=False)
+class PathFigures:
+    """Figures of a path that is commanded in the field: a circle, or a diagonal."""
+
+    name: str
+    figures: dict[str, Figure]
+
+
+def circle_figures(stage: StageMap, radius_m: float,
+                   centre_m: tuple[float, float] = (0.0, 0.0)) -> PathFigures:
+    """Return circular deviation G and radial deviations F of a circle, ISO 230-4.
+
+    G is the range of radii about the least-squares centre of the actual path, Fmax and Fmin the
+    largest and smallest deviation of the radius about the commanded centre. Static: without the
+    contouring errors of the drives, and the mean of both directions of approach.
+
+    Raises
+    ------
+    InputError
+        If the circle is not in the field.
+    """
+    at = stage.error_map.artifact
+    reach = np.array(at.half) * at.grid_pitch_m - np.abs(centre_m)
+    if not 0 < radius_m <= reach.min() * (1 + 1e-9):
+        raise InputError("circle", f"a radius of {radius_m:g} m about {centre_m} m is not in the "
+                         "field", f"give one up to {max(reach.min(), 0.0):g} m")
+    angle = 2 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
+    e = np.stack([np.cos(angle), np.sin(angle)])
+    x, y = np.array(centre_m)[:, None] + radius_m * e
+
+    def figures(path: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the figures of the deviations of paths, (..., 2, points)."""
+        radial = (path * e).sum(axis=-2)
+        centre = 2 * np.einsum("...p,cp->...c", radial, e) / CIRCLE_POINTS
+        about = radial - np.einsum("...c,cp->...p", centre, e)
+        return {"G": np.ptp(about, axis=-1), "Fmax": radial.max(axis=-1),
+                "Fmin": radial.min(axis=-1)}
+
+    return PathFigures(f"circle of radius {radius_m * 1e3:g} mm", _path(stage, (x, y), figures))
+
+
+def diagonal_figures(stage: StageMap) -> list[PathFigures]:
+    """Return the figures of both face diagonals, ISO 230-6, and of their difference.
+
+    ``M`` is the range of the deviation along the diagonal, ``length`` that of its length: actual
+    minus commanded. The difference of the lengths, first minus second, shows the squareness.
+    """
+    at = stage.error_map.artifact
+    hx, hy = np.array(at.half) * at.grid_pitch_m
+    count = 2 * min(at.half) + 1
+    along = np.linspace(-1, 1, count)
+    ends = np.hypot(hx, hy)
+    found = []
+    x = np.concatenate([hx * along, hx * along])
+    y = np.concatenate([hy * along, -hy * along])
+    e = np.stack([np.full(2 * count, hx), np.repeat([hy, -hy], count)]) / ends
+
+    def figures(path: np.ndarray) -> dict[str, np.ndarray]:
+        d = (path * e).sum(axis=-2)
+        one, two = d[..., :count], d[..., count:]
+        lengths = [part[..., -1] - part[..., 0] for part in (one, two)]
+        return {"1 M": np.ptp(one, axis=-1), "1 length": lengths[0], "2 M": np.ptp(two, axis=-1),
+                "2 length": lengths[1], "3 length": lengths[0] - lengths[1]}
+
+    both = _path(stage, (x, y), figures)
+    for key, name in (("1", "diagonal +x +y"), ("2", "diagonal +x -y"),
+                      ("3", "difference of the diagonals")):
+        found.append(PathFigures(name, {
+            symbol.partition(" ")[2]: figure for symbol, figure in both.items()
+            if symbol.startswith(key)}))
+    return found
+
+
+def _path(stage: StageMap, at: tuple[np.ndarray, np.ndarray],
+          figures: Callable[[np.ndarray], dict[str, np.ndarray]]) -> dict[str, Figure]:
+    """Return the figures of the deviations, actual minus commanded, at points of a path."""
+    gx, gy = stage.error(*at)
+    if not np.isfinite(gx + gy).all():
+        raise InputError("path", "it crosses unknown sites", "measure them, or choose another path")
+    deviation = -np.stack([gx, gy])
+    found = figures(deviation)
+    try:
+        drawn = figures(deviation - _draws(stage.covariance(*at)).reshape(DRAWS, 2, -1))
+    except InputError:  # without the correlations of the sites
+        drawn = {name: np.full(1, np.nan) for name in found}
+    return {name: Figure(float(value), _rms_about(drawn[name], float(value)))
+            for name, value in found.items()}
