@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files kept in a bag as MCAP attachments: result, plan, exports.
+
+The messages of the file stay as they are, byte by byte: attachments follow them, and the summary
+is written anew.
+"""
+
+import io
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, DataEnd, Footer, McapRecord, Statistics
+
+from selfcal_ros.bagio.journal_file import records
+from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC
+from selfcal_ros.bagio.mcap_salvage import HEAD
+from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.errors import InputError
+from selfcal_ros.outputs import atomic_file
+
+BLOCK = 1 << 20
+DATA_END_SIZE = HEAD.size + 4
+REMEDY = "record it anew, or give an .mcap file that was closed, without file compression"
+PARSERS = {Opcode.STATISTICS: Statistics.read, Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+           Opcode.ATTACHMENT: Attachment.read}
+_WRITTEN_ANEW = (Opcode.SUMMARY_OFFSET, Opcode.STATISTICS, Opcode.ATTACHMENT_INDEX)
+
+
+@dataclass(frozen=True, eq=False)
+class _Summary:
+    """End of a file: where its data end, and the records of its summary."""
+
+    data_end: int
+    others: bytes
+    statistics: Statistics | None
+    index: tuple[AttachmentIndex, ...]
+
+
+def _parsed(opcode: int, body: bytes) -> McapRecord | None:
+    """Return a record; None if the body is not one of that kind."""
+    try:
+        return PARSERS[Opcode(opcode)](ReadDataStream(io.BytesIO(body)))
+    except (McapError, KeyError, ValueError, struct.error, MemoryError):
+        return None
+
+
+def attached(bag: str | Path) -> dict[str, bytes]:
+    """Return the attachments of a bag by name.
+
+    Raises
+    ------
+    InputError
+        If a file of the bag has no summary, or an attachment is damaged.
+    """
+    out: dict[str, bytes] = {}
+    for path in BagReader(Path(bag)).files:
+        with path.open("rb") as file:
+            for entry in _summary(file, path).index:
+                file.seek(entry.offset)
+                raw = file.read(entry.length)
+                record = _parsed(raw[0], raw[HEAD.size:]) if len(raw) > HEAD.size else None
+                if not isinstance(record, Attachment) or int.from_bytes(raw[-4:], "little") \
+                        not in (0, zlib.crc32(raw[HEAD.size:-4])):  # 0 = not computed
+                    raise InputError(f"{path}: {entry.name}", "the attachment is damaged",
+                                     "embed it again into a copy of the recording")
+                out[entry.name] = bytes(record.data)
+    return out
+
+
+def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns: int) -> None:
+    """Add attachments to the first file of a bag.
+
+    Parameters
+    ----------
+    bag : str or Path
+        The bag; its file is replaced at once, or left as it was.
+    items : sequence of (str, str, bytes)
+        Name, media type and content.
+    log_time_ns : int
+        Time of the attachments.
+
+    Raises
+    ------
+    InputError
+        If the file has no summary, or an attachment of this name.
+    """
+    path = BagReader(Path(bag)).files[0]
+    taken = set(attached(bag))
+    for name, *_ in items:
+        if name in taken:
+            raise InputError(f"{bag}: {name}", "is in the bag already",
+                             "give the file another name, or take a copy of the recording")
+        taken.add(name)
+    with path.open("rb") as file, atomic_file(path) as out:
+        summary = _summary(file, path)
+        file.seek(0)
+        _copy(file, out, summary.data_end)
+        index = list(summary.index)
+        for name, kind, data in items:
+            raw = records(Attachment(log_time_ns, log_time_ns, name, kind, data))
+            index.append(AttachmentIndex(out.tell(), len(raw), log_time_ns, log_time_ns, len(data),
+                                         name, kind))
+            out.write(raw)
+        out.write(records(DataEnd(0)))
+        more: list[McapRecord] = list(index)
+        if summary.statistics is not None:
+            more.append(replace(summary.statistics, attachment_count=len(index)))
+        text, start = summary.others + records(*more), out.tell()
+        crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0),
+                         zlib.crc32(text))
+        out.write(text + records(Footer(start, 0, crc)) + MAGIC)
+
+
+def _copy(file: BinaryIO, out: BinaryIO, size: int) -> None:
+    """Copy the first `size` bytes of a file."""
+    while size > 0 and (block := file.read(min(size, BLOCK))):
+        out.write(block)
+        size -= len(block)
+
+
+def _summary(file: BinaryIO, path: Path) -> _Summary:
+    """Return the end of a file; InputError if it has no complete one."""
+    tail = HEAD.size + FOOTER_SIZE + len(MAGIC)
+    size = file.seek(0, 2)
+    file.seek(max(size - tail, 0))
+    raw = file.read()
+    start = int.from_bytes(raw[HEAD.size:HEAD.size + 8], "little")
+    complete = len(raw) == tail and raw[0] == Opcode.FOOTER and raw.endswith(MAGIC) and (
+        DATA_END_SIZE < start <= size - tail)
+    if complete:
+        file.seek(start - DATA_END_SIZE)
+        complete = file.read(HEAD.size) == HEAD.pack(Opcode.DATA_END, 4)
+    if not complete:
+        raise InputError(str(path), "no MCAP file with a summary", REMEDY)
+    file.seek(start)
+    text, at = file.read(size - tail - start), 0
+    crc = int.from_bytes(raw[HEAD.size + 16:HEAD.size + 20], "little")
+    if crc not in (0, zlib.crc32(raw[:HEAD.size + 16], zlib.crc32(text))):  # 0 = not computed
+        raise InputError(str(path), "its summary is damaged", REMEDY)
+    others, statistics, index = [], None, []
+    while at + HEAD.size <= len(text):
+        opcode, length = HEAD.unpack_from(text, at)
+        body = text[at + HEAD.size:at + HEAD.size + length]
+        record = _parsed(opcode, body)
+        if len(body) < length or (opcode in _WRITTEN_ANEW[1:] and record is None):
+            raise InputError(str(path), "its summary is damaged", REMEDY)
+        if isinstance(record, Statistics):
+            statistics = record
+        elif isinstance(record, AttachmentIndex):
+            index.append(record)
+        elif opcode not in _WRITTEN_ANEW:
+            others.append(text[at:at + HEAD.size + length])
+        at += HEAD.size + length
+    return _Summary(start - DATA_END_SIZE, b"".join(others), statistics, tuple(index))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal embed``: files in the bag and out again; the messages stay as they are."""
+
+import json
+import shutil
+
+import pytest
+from mcap.reader import make_reader
+
+from selfcal_ros.bagio.attachments import attach, attached
+from selfcal_ros.cli.main import main
+from selfcal_ros.errors import InputError
+from test.support.pages import ROOT
+
+
+@pytest.fixture
+def bag(tmp_path):
+    shutil.copytree(ROOT / "bags/hu_exact", tmp_path / "bag")
+    return tmp_path / "bag"
+
+
+def file_in(bag):
+    return next(bag.glob("*.mcap"))
+
+
+def seen(bag):
+    """Return what another reader finds: messages, attachments and their counts."""
+    with file_in(bag).open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        messages = [(m.channel_id, m.log_time, m.data) for _, _, m in reader.iter_messages()]
+        files = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
+        statistics = reader.get_summary().statistics
+        assert statistics.attachment_count == len(files)
+        assert statistics.message_count == len(messages)
+        return messages, files, len(reader.get_summary().chunk_indexes)
+
+
+def test_files_go_in_and_out_and_the_messages_stay(bag, tmp_path, capsys):
+    before = seen(bag)
+    result, plan = tmp_path / "r.json", ROOT / "config/plans/hu.yaml"
+    assert main(["solve", str(bag), "--quiet", "-o", str(result)]) == 0
+    start = file_in(bag).read_bytes()
+    assert main(["embed", str(bag)]) == 0
+    assert "no attachments" in capsys.readouterr().out
+    assert main(["embed", str(bag), str(result), str(plan)]) == 0
+    assert capsys.readouterr().out == (f"r.json: {result.stat().st_size} bytes\n"
+                                       f"hu.yaml: {plan.stat().st_size} bytes\n")
+    messages, files, chunks = seen(bag)
+    assert (messages, chunks) == (before[0], before[2])
+    assert files == {"r.json": ("application/json", result.read_bytes()),
+                     "hu.yaml": ("application/yaml", plan.read_bytes())}
+    now = file_in(bag).read_bytes()
+    same = next(i for i, (a, b) in enumerate(zip(start, now, strict=False)) if a != b)
+    assert same > 0.5 * len(start) and len(now) > len(start)
+    table = tmp_path / "t.csv"
+    assert main(["table", str(result), "-o", str(table)]) == 0
+    assert main(["embed", str(bag), str(table)]) == 0
+    assert set(seen(bag)[1]) == {"r.json", "hu.yaml", "t.csv"} == set(attached(bag))
+    out = tmp_path / "out"
+    out.mkdir()
+    capsys.readouterr()
+    assert main(["embed", str(bag), "--extract", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [item["name"] for item in said["attachments"]] == ["r.json", "hu.yaml", "t.csv"]
+    for path in (result, plan, table):
+        assert (out / path.name).read_bytes() == path.read_bytes()
+    again = tmp_path / "again.json"
+    assert main(["solve", str(bag), "--quiet", "-o", str(again)]) == 0
+    one, two = (json.loads(path.read_text()) for path in (result, again))
+    assert one["error_map"] == two["error_map"] and one["input"] != two["input"]
+
+
+def test_a_result_of_another_bag_is_refused(bag, tmp_path, capsys):
+    other = tmp_path / "other.json"
+    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", str(other)]) == 0
+    before = file_in(bag).read_bytes()
+    assert main(["embed", str(bag), str(other)]) == 2
+    assert "other.json: is not a result of" in capsys.readouterr().err
+    assert file_in(bag).read_bytes() == before
+
+
+def test_a_name_is_taken_once(bag, tmp_path):
+    attach(bag, [("a.txt", "text/plain", b"1")], 1)
+    before = file_in(bag).read_bytes()
+    for items in ([("a.txt", "text/plain", b"2")], [("b", "", b""), ("b", "", b"")]):
+        with pytest.raises(InputError, match="is in the bag already"):
+            attach(bag, items, 1)
+    assert file_in(bag).read_bytes() == before and attached(bag) == {"a.txt": b"1"}
+
+
+@pytest.mark.parametrize(("spoil", "message"), [
+    (lambda raw: raw[:-20], "no MCAP file with a summary"),
+    (lambda raw: raw[:40], "no MCAP file with a summary"),
+    (lambda raw: b"", "no MCAP file with a summary"),
+    (lambda raw: raw.replace(b"kept as it is", b"kept as it was"[:13]), "attachment is damaged"),
+])
+def test_a_file_that_was_not_closed_or_is_damaged_is_refused(bag, spoil, message):
+    attach(bag, [("a.txt", "text/plain", b"kept as it is")], 1)
+    path = file_in(bag)
+    path.write_bytes(spoil(path.read_bytes()))
+    with pytest.raises(InputError, match=message):
+        attached(bag)
+    with pytest.raises(InputError, match=message):
+        attach(bag, [("b.txt", "text/plain", b"")], 1)
+
+
+def test_no_damage_of_the_end_is_more_than_one_line(bag):
+    attach(bag, [("a.txt", "text/plain", b"content")], 1)
+    path = file_in(bag)
+    raw = path.read_bytes()
+    for back in range(1, 400, 7):
+        spoiled = bytearray(raw)
+        spoiled[-back] ^= 0xFF
+        path.write_bytes(spoiled)
+        try:
+            assert attached(bag) == {"a.txt": b"content"}
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+def test_files_and_extract_exclude_each_other(bag, capsys):
+    assert main(["embed", str(bag), "x.json", "--extract", "."]) == 2
+    assert "files are named, too" in capsys.readouterr().err
+    assert main(["embed", str(bag / "missing")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
