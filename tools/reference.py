@@ -32,6 +32,9 @@ PLAN = {
     "visit_order": "order of the marks in views without their own "
                    "(docs/identifiability.md); default: chosen by the cell",
     "model_terms": "list of TERM or TERM:SIZE to be estimated with the map; default: none",
+    "artifact_from": "RESULT.json of the calibration that made the plate known, relative to the "
+                     "plan (docs/recheck.md); `artifact` and `map` are then those of the result "
+                     "unless given; default: the plate is not known",
     "microscope": "standard uncertainties of the microscope; default: the solver's "
                   "parameters of these names",
     "microscope.scale_u": "of its scale, m/m; default 0.01",

@@ -34,11 +34,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check the cell, print the results; exit code 5 if a check fails."""
     from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
-    from selfcal_ros.files import read_bytes, read_yaml
-    from selfcal_ros.model.view import plan_from_dict
+    from selfcal_ros.collection.settings.plans import read_plan
+    from selfcal_ros.files import read_bytes
 
     need_ros("")
-    plan_from_dict(read_yaml(args.plan), args.plan)
+    read_plan(args.plan)
     for option in ("settle", "patience"):
         if not 0 <= getattr(args, option) < 1e6:
             raise InputError(f"--{option}", f"{getattr(args, option):g} s is not a waiting time",

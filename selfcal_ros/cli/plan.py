@@ -66,10 +66,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sub-verb and return its exit code."""
-    from selfcal_ros.files import read_yaml
-    from selfcal_ros.model.view import plan_from_dict
+    from selfcal_ros.collection.settings.plans import read_plan
 
-    plan = plan_from_dict(read_yaml(args.plan), args.plan)
+    plan = read_plan(args.plan)
+    if plan.artifact_from:
+        from selfcal_ros.cli.recheck import planned
+
+        return planned(args, _repeated(plan, args.repeats if args.plan_verb == "check" else None))
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
 
 

@@ -2,8 +2,14 @@
 """``selfcal recheck``: one view of a calibrated plate, and whether the stage is as it was."""
 
 import argparse
+import json
+from typing import TYPE_CHECKING
 
 from selfcal_ros.cli import solve
+from selfcal_ros.cli.terminal import busy, tell
+
+if TYPE_CHECKING:
+    from selfcal_ros.model.view import Plan
 
 HELP = "whether a stage is as its calibration found it, from one view of the same plate"
 
@@ -18,3 +24,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Collect, find the map and its change, print both and write the result."""
     return solve.run(args)
+
+
+def planned(args: argparse.Namespace, plan: "Plan") -> int:
+    """Print what views of a known plate will tell; for `selfcal plan check`."""
+    from selfcal_ros.collection.settings.plans import calibration_of
+    from selfcal_ros.errors import ExitCode, InputError
+    from selfcal_ros.estimation.recheck.known import known_plate
+    from selfcal_ros.estimation.recheck.planned import predict_recheck
+    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.reporting.summary.format import counted
+
+    if args.plan_verb == "suggest":
+        raise InputError(args.plan, "its plate is known: any view that reads all marks will do",
+                         "check the plan")
+    plate = known_plate(calibration_of(plan.artifact_from), plan.artifact_from)
+    with busy("judging the plan"):
+        found = predict_recheck(plan, plate)
+    if args.json:
+        print(json.dumps(plain({
+            "plan_id": plan.plan_id, "identifiable": True, "artifact_from": plan.artifact_from,
+            "predicted": {"rms_gain_xy": found.map.rms_xy, "max_gain_xy": found.map.max_xy,
+                          "rms_gain_theta": found.map.rms_theta,
+                          "rms_gain_change": found.change}}), indent=1))
+        return int(ExitCode.DONE)
+    tell("\n".join([
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate that "
+        f"{plan.artifact_from} made known",
+        "predicted standard uncertainty, for unit noise of one averaged reading:",
+        f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
+        *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
+        f"  change of XY since then: rms {found.change:.4f}"]))
+    return int(ExitCode.DONE)

@@ -36,12 +36,12 @@ def run(args: argparse.Namespace) -> int:
     """Start and supervise the nodes, show the screen, stop the nodes at the end."""
     from selfcal_ros.cli.monitor import watch
     from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
+    from selfcal_ros.collection.settings.plans import read_plan
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_bytes, read_yaml
-    from selfcal_ros.model.view import plan_from_dict
+    from selfcal_ros.files import read_bytes
 
     need_ros("")
-    plan_from_dict(read_yaml(args.plan), args.plan)
+    read_plan(args.plan)
     if args.params:
         read_bytes(args.params)
     if args.bag and Path(args.bag).exists():

@@ -93,7 +93,8 @@ class Detection:
 class Command:
     """One view command. `artifact` and `view` are None for DONE and ABORT.
 
-    `model_terms` are the terms of the plan to be estimated with the map, as text.
+    `model_terms` are the terms of the plan to be estimated with the map, as text; `artifact_from`
+    is the result that made the plate known.
     """
 
     stamp_ns: int
@@ -105,6 +106,7 @@ class Command:
     views_planned: int = 0
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
+    artifact_from: str = ""
 
     def placed(self) -> View:
         """Return the view of a PLACE or MEASURE.

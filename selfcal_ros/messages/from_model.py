@@ -92,7 +92,7 @@ def command(c: Command, frame_id: str) -> Fields:
             "model_terms": list(c.model_terms),
             "check_marks": c.view.check_marks if c.view else 0,
             "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact),
-            **_image(c.view)}
+            **_image(c.view), "artifact_from": c.artifact_from}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -137,7 +137,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_motion("motion_theta", readings.motion_theta), "run_id": measurements.run_id,
         "model_terms": list(measurements.model_terms), "session_notes": list(notes),
         **_map_grid(measurements.artifact), **_image(readings.view),
-        "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1]}
+        "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1],
+        "artifact_from": measurements.artifact_from}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

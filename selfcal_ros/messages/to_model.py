@@ -89,12 +89,18 @@ def command(message: Any) -> Command:
                 angular=bool(message.angular)) if placed else None,
         artifact_of(message) if placed else None,
         views_planned=int(getattr(message, "views_planned", 0)),
-        run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message))
+        run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message),
+        artifact_from=plate_from(message))
 
 
 def terms_of(message: Any) -> tuple[str, ...]:
     """Return the terms of a ViewCommand or ViewMeasurement; none in old bags."""
     return tuple(map(str, getattr(message, "model_terms", ())))
+
+
+def plate_from(message: Any) -> str:
+    """Return the result that made the plate of a ViewCommand or ViewMeasurement known, or ""."""
+    return str(getattr(message, "artifact_from", ""))
 
 
 def notes_of(message: Any) -> tuple[str, ...]:

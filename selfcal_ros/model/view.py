@@ -228,18 +228,21 @@ class Plan:
         Views to be measured.
     model_terms : tuple of str
         Terms to be estimated with the map, see `selfcal_ros.model.terms`.
+    artifact_from : str
+        RESULT.json of the calibration that made the plate known; empty if it is not.
     """
 
     plan_id: str
     artifact: Artifact
     views: tuple[View, ...]
     model_terms: tuple[str, ...] = ()
+    artifact_from: str = ""
 
     @property
     def check_stops(self) -> tuple[int, float]:
-        """Number of marks checked in each view with grid marks, and their distance, m."""
-        return next(((view.check_marks, view.check_offset_m) for view in self.views if view.grid),
-                    (0, 0.0))
+        """Marks checked in each view of grid marks, and their distance, m."""
+        checks = ((view.check_marks, view.check_offset_m) for view in self.views if view.grid)
+        return next(checks, (0, 0.0))
 
 
 def plan_from_dict(data: object, where: str) -> Plan:
@@ -256,7 +259,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
         (default for views off the lattice: `default_map_grid`), ``model_terms``,
         a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
         with grid marks, ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
-        of the microscope, and ``image {nx, ny, pitch_m}``, marks that an exposure shows.
+        of the microscope, ``image {nx, ny, pitch_m}``, marks that an exposure shows, and the
+        result ``artifact_from``, which made the plate known.
     where : str
         File name, for messages.
 
@@ -269,7 +273,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
                             {"visit_order": (str, ""), "model_terms": (list, []),
                              "check_stops": (dict, {}), "microscope": (dict, {}),
-                             "map": (dict, {}), "image": (dict, {})})
+                             "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, "")})
     raw = checked_fields(fields["artifact"], f"{where}: artifact",
                          {"grid_size": int, "grid_pitch": float, "angular_count": int},
                          {"grid_size_y": (int, 0)})
@@ -294,15 +298,13 @@ def plan_from_dict(data: object, where: str) -> Plan:
                          f"the image are more than {MAX_VIEWS}", "state fewer marks in an image")
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
-    names: set[str] = set()
     for index, view in enumerate(views):
-        if view.name in names:
+        if view.name in [other.name for other in views[:index]]:
             raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
                              "give every view its own name")
-        names.add(view.name)
     terms = terms_of(fields["model_terms"], where)
     return Plan(fields["plan_id"], artifact, views, with_microscope(
-        terms, fields["microscope"], f"{where}: microscope"))
+        terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"])
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
@@ -393,5 +395,6 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
             "views": [view_to_dict(view, artifact) for view in plan.views],
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"image": dict(vars(image))} if image else {}),
-            **({"model_terms": list(plan.model_terms)} if plan.model_terms else {})}
+            **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
+            **({"artifact_from": plan.artifact_from} if plan.artifact_from else {})}
 

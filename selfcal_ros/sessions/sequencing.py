@@ -13,12 +13,12 @@ from selfcal_ros.collection.expected import expected_marks
 from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
+from selfcal_ros.collection.settings.plans import read_plan
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_yaml
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import placing_digest
-from selfcal_ros.model.view import Plan, View, plan_from_dict
+from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.clocks import is_future
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, Presence, StallWatch, missing_marks
 from selfcal_ros.topics import COMMAND_TOPIC
@@ -33,7 +33,7 @@ SET_BACK_S = 0.1
 
 def load_plan(path: str) -> Plan:
     """Return the plan in a PLAN.yaml."""
-    return plan_from_dict(read_yaml(path), path)
+    return read_plan(path)
 
 
 class SequencingSession:

@@ -202,7 +202,7 @@ class SolvingSession:
         return Measurements(ordered[0].plan_id, artifact, views,
                             to_model.sense_of(ordered[0]),
                             to_model.counts(newest, "session_reject"), self._run.run_id,
-                            to_model.terms_of(newest))
+                            to_model.terms_of(newest), to_model.plate_from(newest))
 
     def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""

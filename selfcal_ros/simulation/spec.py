@@ -13,6 +13,7 @@ from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
+from selfcal_ros.collection.settings.plans import plan_of, read_plan
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
@@ -305,8 +306,8 @@ def _fields_of(values: Mapping[str, Any], keys: Section, defaults: Any) -> dict[
 def _plan(plan: Any, path: Path) -> Plan:
     if isinstance(plan, str):
         source = path.parent / plan
-        return plan_from_dict(read_yaml(source), str(source))
-    return plan_from_dict(plan, f"{path}: plan")
+        return read_plan(source)
+    return plan_of(plan, f"{path}: plan", path.parent)
 
 
 def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:

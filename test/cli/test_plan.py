@@ -25,7 +25,8 @@ def shipped(name):
     return str(PLANS[0].parent / f"{name}.yaml")
 
 
-@pytest.mark.parametrize("path", PLANS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [path for path in PLANS if path.stem != "recheck"],
+                         ids=lambda p: p.stem)
 def test_every_shipped_plan_is_what_its_name_says(path, capsys):
     deficient = path.stem.startswith("deficient_")
     assert main(["plan", "check", str(path), "--json"]) == (3 if deficient else 0)

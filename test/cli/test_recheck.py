@@ -3,9 +3,11 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
+from selfcal_ros.collection.settings.plans import read_plan
 from selfcal_ros.files import read_json
 
 PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}
@@ -74,3 +76,47 @@ def test_a_recheck_knows_no_plate(folder, capsys):
     assert main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", out]) == 0
     assert main(["recheck", out, str(folder / "same")]) == 2
     assert "a recheck itself" in capsys.readouterr().err
+
+
+def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
+    """Alone, relative to the plan: the plate is that of the result."""
+    plan = {"plan_id": "morning", "artifact_from": "r.json", "views": [{"name": "again"}]}
+    (folder / "plan.yaml").write_text(json.dumps(plan))
+    assert main(["plan", "check", str(folder / "plan.yaml"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["artifact_from"] == str(folder / "r.json")
+    wanted = found["predicted"]
+    assert main(["plan", "check", str(folder / "plan.yaml")]) == 0
+    text = capsys.readouterr().out
+    assert f"1 view of the plate that {folder / 'r.json'} made known" in text
+    assert f"change of XY since then: rms {wanted['rms_gain_change']:.4f}" in text
+    spec = SEEDS | {"noise_seed": 2, "plan": "plan.yaml"}
+    (folder / "morning.yaml").write_text(json.dumps(spec))
+    bag, one, other = (str(folder / name) for name in ("morning", "one.json", "other.json"))
+    assert main(["simulate", str(folder / "morning.yaml"), "-o", bag]) == 0
+    bare = ["--model", "none", "--misalignment", "linear"]
+    assert main(["solve", bag, "-o", one, *bare]) == 0
+    assert main(["recheck", str(folder / "r.json"), bag, "-o", other, *bare]) == 0
+    one, other = read_json(one), read_json(other)
+    for result in (one, other):
+        del result["provenance"]["created"]
+    assert one == other
+    u = np.array([one["error_map"]["u_gx"], one["error_map"]["u_gy"]])
+    assert np.sqrt(np.mean(u**2)) / one["noise"]["sigma_xy"] == pytest.approx(
+        wanted["rms_gain_xy"], rel=1e-3)
+    assert one["recheck"]["u_rms"] / one["noise"]["sigma_xy"] == pytest.approx(
+        wanted["rms_gain_change"], rel=1e-3)
+
+
+def test_plans_without_the_result_that_they_name(folder, tmp_path, capsys):
+    """A plan that describes its plate loads without it."""
+    path = tmp_path / "plan.yaml"
+    plan = {"plan_id": "p", "artifact_from": "none.json", "views": [{"name": "again"}]}
+    path.write_text(json.dumps(plan))
+    assert main(["plan", "check", str(path)]) == 2
+    assert f"{tmp_path / 'none.json'}: no such file" in capsys.readouterr().err
+    path.write_text(json.dumps(plan | {"artifact": PLAN["artifact"]}))
+    assert read_plan(path).artifact_from == str(tmp_path / "none.json")
+    path.write_text(json.dumps(plan | {"artifact_from": str(folder / "r.json")}))
+    assert main(["plan", "suggest", str(path)]) == 2
+    assert "its plate is known" in capsys.readouterr().err

@@ -119,7 +119,8 @@ MAP_FIELDS = {"map_grid_size": 9, "map_grid_size_y": 11, "map_grid_pitch": 0.02,
 def test_fields_of_a_command_by_name():
     view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y", 3, 2e-5)
     made = from_model.command(Command(STAMP_NS, Phase.MEASURE, "p", 3, view,
-                                       PLATE, 9, model_terms=("drift:1e-08",)), "f")
+                                       PLATE, 9, model_terms=("drift:1e-08",),
+                                       artifact_from="/r.json"), "f")
     del made["header"]
     assert made == {
         "phase": 1, "plan_id": "p", "view_index": 3, "view_name": "turned",
@@ -127,7 +128,7 @@ def test_fields_of_a_command_by_name():
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
         "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS,
-        **NO_IMAGE}
+        **NO_IMAGE, "artifact_from": "/r.json"}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -266,7 +267,8 @@ def test_sums_over_repeats_come_back():
 
 
 def test_fields_of_a_view_measurement_by_name():
-    made = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+    known = replace(MEASURED, artifact_from="/r.json")
+    made = from_model.view_measurement(PROGRESS, known, STAMP_NS, "f")
     del made["header"]
     np.testing.assert_array_equal(made.pop("motion"), 1e-15 * np.arange(16.0))
     np.testing.assert_array_equal(made.pop("motion_theta"), 1e-12 * np.arange(1.0, 5.0))
@@ -282,7 +284,7 @@ def test_fields_of_a_view_measurement_by_name():
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
         "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
-        **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0}
+        **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0, "artifact_from": "/r.json"}
 
 
 def test_fields_of_a_view_status_by_name():

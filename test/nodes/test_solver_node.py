@@ -4,6 +4,7 @@
 import json
 import re
 import threading
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,6 +16,8 @@ from visualization_msgs.msg import Marker
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import ExitCode, NotSettledError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
@@ -24,6 +27,7 @@ from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill, map_geometry
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.sessions.map_files import read_result
 from selfcal_ros.sessions.solving import Outcome, short
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan
@@ -390,3 +394,15 @@ def test_a_malformed_measurement_does_not_end_the_solver(graph):
     graph.until(lambda: summaries and summaries[-1].identifiable
                 and summaries[-1].views_done == len(messages), "the good views")
     assert node.session.result is not None
+
+
+def test_a_known_plate_gives_what_the_bag_gives(solve, graph, tmp_path):
+    path = tmp_path / "first.json"
+    write_json(path, result_to_dict(worded(calibrate(measured()[1]))))
+    plan = replace(PLAN, plan_id="again", views=PLAN.views[:1], artifact_from=str(path))
+    maps, summaries, measurements = solve(plan)
+    graph.until(lambda: maps, "a map")
+    assert measurements.artifact_from == str(path)
+    known = read_result(str(path))
+    same_map(maps[-1], calibrate(measurements, Options(plate=known)).error_map)
+    assert summaries[-1].state.startswith(("Still good", "Changed"))

@@ -12,11 +12,17 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import MAX_TEXT, Command, Detection, Kind, Phase, begun_ns
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import session_digest, view_digest
+from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import DEFAULT_TERMS
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, supersedes
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
@@ -82,6 +88,26 @@ def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
     without.take(views_of(plan))
     assert without.session.result.model.terms == ()
     assert "model_terms_from" not in without.session.result.provenance.extra
+
+
+def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
+    first = collected(events_of(PLAN))[1]
+    path = str(tmp_path / "first.json")
+    write_json(path, result_to_dict(worded(calibrate(first, Options()))))
+    plan = replace(PLAN, plan_id="again", views=PLAN.views[:1], artifact_from=path)
+    desk.take(views_of(plan))
+    shown = desk.session.result
+    readings = collected(events_of(plan))[1]
+    assert readings.artifact_from == path
+    offline = worded(calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings)))
+    assert json.dumps(result_to_dict(replace(shown, run_id=offline.run_id))) == json.dumps(
+        result_to_dict(offline))
+    assert shown.extra["recheck"]["of"] == path
+    told, = [fields["state"] for output, fields in desk.hands.published if output == "summary"]
+    assert told.startswith("Still good: no change since first.json")
+    lost = Desk()
+    with pytest.raises(InputError, match="no such file"):
+        lost.take(views_of(replace(plan, artifact_from=str(tmp_path / "none.json"))))
 
 
 def test_pictures_come_after_what_they_show(desk):

@@ -2,12 +2,11 @@
 """From the settings of the solver to the options of the estimator."""
 
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
+from selfcal_ros.collection.settings.plans import calibration_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.files import read_json
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 
 
@@ -40,17 +39,6 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    drift_degree=settings.drift_degree, plate_from=plate_from,
                    plate=calibration_of(plate_from) if plate_from else None,
                    magnification_limit=settings.magnification_limit)
-
-
-def calibration_of(path: str) -> CalibrationResult:
-    """Return the calibration in a RESULT.json.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    return result_from_dict(read_json(path), path)
 
 
 def _terms(given: list[str],

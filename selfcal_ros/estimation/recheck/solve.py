@@ -2,7 +2,7 @@
 """Views of a known plate to a result: the map of the stage, its uncertainty, what has changed."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -59,6 +59,58 @@ KEY = "recheck"
 """Key of what a recheck found among the extras of a result."""
 
 
+@dataclass(frozen=True, eq=False)
+class Rechecked:
+    """What views of a known plate tell.
+
+    Attributes
+    ----------
+    readings : PlateReadings
+        The readings.
+    new, lines : NewMap, NewLines
+        Both maps, stage frame.
+    seen : Seen
+        The solution of the marks, frame of the equations.
+    xy, theta : NoiseEstimate
+        Noise of one reading of each kind.
+    """
+
+    readings: PlateReadings
+    new: NewMap
+    lines: NewLines
+    seen: Seen
+    xy: NoiseEstimate
+    theta: NoiseEstimate
+
+    def error_map(self, plate: KnownPlate) -> ErrorMap:
+        """Return the map with its uncertainty, without scale unless a reference length sets it."""
+        new, artifact, known = self.new, self.new.artifact, self.new.known
+        xy = new.xy if plate.result.reference else new.without_scale(
+            new.xy.reshape(-1)).reshape(new.xy.shape)
+        variance = np.sum(list(new.variances(plate).values()), axis=0).reshape(xy.shape)
+        (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan)
+                                for values in (xy, np.sqrt(variance)))
+        length = artifact.grid_pitch_m * max(artifact.half)
+        z = (artifact.x_m + 1j * artifact.y_m) / length
+        o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(gx + 1j * gy))
+        theta = self.lines.values
+        u_theta = np.where(np.isfinite(theta), np.sqrt(np.diag(self.lines.covariance(plate))),
+                           np.nan)
+        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o / length, r / length,
+                        ThetaDatum.ZERO_MEAN)
+
+
+def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
+    """Return what `recheck` makes its result of."""
+    if options.method != "joint" or options.reference is not None:
+        raise InputError("options", "a recheck has the method joint, and the reference length of "
+                         "the plate's calibration", "leave them out")
+    readings = plate_readings(on_plate(measurements, plate), options, plate)
+    xy, theta = _noise(readings.problem, plate)
+    new, seen = _new_map(readings, plate, xy, options)
+    return Rechecked(readings, new, _new_lines(readings, plate, theta), seen, xy, theta)
+
+
 @one_thread()
 def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> CalibrationResult:
     """Return the map of the stage from views of a known plate, and what has changed.
@@ -77,22 +129,15 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     NoDataError, NotIdentifiableError, InputError
         If no known mark was read, too little is known, or the readings do not fit the plate.
     """
-    if options.method != "joint" or options.reference is not None:
-        raise InputError("options", "a recheck has the method joint, and the reference length of "
-                         "the plate's calibration", "leave them out")
-    readings = plate_readings(on_plate(measurements, plate), options, plate)
-    xy, theta = _noise(readings.problem, plate)
-    new, seen = _new_map(readings, plate, xy, options)
-    lines = _new_lines(readings, plate, theta)
-    found = record(map_change(new, plate), line_change(lines, plate),
-                   new.artifact, plate.where)
-    parts = new.variances(plate)
-    emap = _error_map(readings, new, lines, plate, parts)
-    noise = _with_coverage(noise_of(xy, theta), parts, plate)
-    failed, before = _misfit(seen, xy.dof), plate.result.verdict
+    solved = recheck_of(measurements, options, plate)
+    readings, seen, parts = solved.readings, solved.seen, solved.new.variances(plate)
+    found = record(map_change(solved.new, plate), line_change(solved.lines, plate),
+                   solved.new.artifact, plate.where)
+    noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
+    failed, before = _misfit(seen, solved.xy.dof), plate.result.verdict
     result = CalibrationResult(
-        measurements.plan_id, emap, plate.result.artifact_map, _views(readings, seen),
-        _observability(seen), noise, measurements.all_rejected(),
+        measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
+        _views(readings, seen), _observability(seen), noise, measurements.all_rejected(),
         findings=(Finding("changed", found["largest"]["change"], found["largest"]["u"], "m",
                           found["p"], axis=found["largest"]["axis"], details={
                               "x": found["largest"]["x"], "y": found["largest"]["y"],
@@ -222,23 +267,6 @@ def _misfit(seen: Seen, dof_noise: float) -> tuple[Finding, ...]:
     p = float(chdtrc(dof, square) if dof_noise >= MANY_DOF else fdtrc(dof, dof_noise, square / dof))
     more = float(np.sqrt(square / dof))
     return (Finding("plate_misfit", more, unit="m/m", p=p),) if p < F_LEVEL and more > SAME else ()
-
-
-def _error_map(readings: PlateReadings, new: NewMap, lines: NewLines, plate: KnownPlate,
-               parts: dict[str, np.ndarray]) -> ErrorMap:
-    """Return the map with its uncertainty; without scale unless a reference length sets it."""
-    artifact, known = new.artifact, new.known
-    xy = new.xy if plate.result.reference else new.without_scale(new.xy.reshape(-1)).reshape(
-        new.xy.shape)
-    variance = np.sum(list(parts.values()), axis=0).reshape(xy.shape)
-    (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan) for values in (xy, np.sqrt(variance)))
-    length = artifact.grid_pitch_m * max(artifact.half)
-    z = (artifact.x_m + 1j * artifact.y_m) / length
-    o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(gx + 1j * gy))
-    u_theta = np.where(np.isfinite(lines.values), np.sqrt(np.diag(lines.covariance(plate))),
-                       np.nan)
-    return ErrorMap(artifact, gx, gy, u_x, u_y, lines.values, u_theta, o / length, r / length,
-                    ThetaDatum.ZERO_MEAN)
 
 
 def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
