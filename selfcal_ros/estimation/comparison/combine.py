@@ -155,14 +155,13 @@ def _xy_run(part: Part, known: np.ndarray, *, keep_scale: bool) -> Run:
     if result is None:
         return Run(values, u**2, np.zeros(len(u)), False, np.inf, False)
     covariance, is_full = xy_covariance(result, known)
-    common = _common(result, known, keep_scale=keep_scale)
-    if not is_full:
-        common = np.diag(common).copy()
+    factors = _common(result, known, keep_scale=keep_scale)
+    common = factors.T @ factors if is_full else (factors**2).sum(axis=0)
     return Run(values, covariance - common, common, True, result.noise.dof_of("xy"), is_full)
 
 
 def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -> np.ndarray:
-    """Return the covariance of what the runs of a machine share, (2n, 2n), m^2.
+    """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
     Terms of the microscope that are known from elsewhere, and the reference length.
     """
@@ -172,12 +171,12 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
     of_terms = result.extra[KEY]["terms"] if KEY in result.extra else []
     factors = factors_of(result)[np.isin(of_terms, names)][:, :, known]
     factors = factors.reshape(len(factors), 2 * int(known.sum()))
-    total = factors.T @ factors * np.nan_to_num(result.noise.sigma_xy) ** 2
+    factors = factors * np.nan_to_num(result.noise.sigma_xy)
     if keep_scale and result.reference is not None:
         at = result.artifact
         place = np.concatenate([at.x_m[known], at.y_m[known]]) * result.reference["u_relative"]
-        total = total + np.outer(place, place)
-    return total
+        factors = np.concatenate([factors, place[None]])
+    return factors
 
 
 def _theta_run(part: Part, lines: np.ndarray) -> Run:

@@ -14,6 +14,7 @@ from selfcal_ros.estimation.comparison.between import Run, mean_of, variance_bet
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
+from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.json_form import plain
@@ -22,10 +23,12 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.maps import random_map, result_of
 from test.support.options import bare
 from tools.combining import ARTIFACT, Case, combined, judged
 
 NO_SHAPES = np.zeros((4, 0))
+GTC_DOF = 7.518796992481201
 
 
 def run_of(values, variance, *, common=0.0, shares=True, dof=np.inf):
@@ -220,6 +223,31 @@ def test_sites_that_a_run_does_not_know_are_unknown():
     assert np.isnan(found.error_map.gx).sum() == 1
     assert worded(found).warnings == (
         "sites that are not known in all runs are unknown in the mean: 1",)
+
+
+def test_large_fields_are_combined_by_their_variances():
+    """Beyond 31 x 31 sites correlations are not kept: independent nodes, three maps, u / 3^1/2."""
+    artifact, rng = Artifact(41, 0.01), np.random.default_rng(3)
+    base = random_map(artifact, 1)
+    u = np.full(artifact.shape, 3e-9)
+    maps = [replace(base, gx=base.gx + rng.normal(0, u), gy=base.gy + rng.normal(0, u), u_gx=u,
+                    u_gy=u) for _ in range(3)]
+    found = combine([Part(name, emap, replace(result_of(emap), input={}))
+                     for name, emap in zip("abc", maps, strict=True)])
+    assert found.xy.covariance.ndim == 1 and "map_covariance" not in found.result.extra
+    emap = found.result.error_map
+    np.testing.assert_allclose(emap.u_gx, 3e-9 / np.sqrt(3), rtol=0.05)
+    assert all(not run.test.correlated and not run.test.significant
+               for run in found.xy.deviations)
+    beyond = np.mean([abs(run.e_n) > 1 for run in found.xy.deviations])
+    assert beyond == pytest.approx(0.0455, abs=0.01)
+
+
+def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
+    """dof(x1 - x2) by GTC 1.5.1, ureal(0, 2, 5) - ureal(0, 1, 8): E_n has its k."""
+    runs = [run_of([9.0, 0, 0, 0], 4.0, dof=5.0), run_of(np.zeros(4), 1.0, dof=8.0)]
+    e_n = mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[0].e_n[0]
+    assert e_n == pytest.approx(9.0 / (coverage_factor(GTC_DOF) * np.sqrt(5.0)), rel=1e-6)
 
 
 @pytest.mark.parametrize(("parts", "message"), [
