@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.records import Channel, Message, Schema
 
 from selfcal_ros.bagio.mcap_stream import McapStream
@@ -16,6 +17,7 @@ from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model
+from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.topics import (
     DETECTION_TOPIC,
     IMAGE_TOPICS,
@@ -188,3 +190,19 @@ def _number(writer: BagWriter, item: Item, numbers: dict[tuple, int]) -> int:
     if key not in numbers:
         numbers[key] = writer.add_copy(item.channel, item.schema)
     return numbers[key]
+
+
+def encoder_track(path: str | Path, joints: tuple[str, str] = ("x", "y"),
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stamps (n,), ns, and the indicated positions (n, 2) of two joints, by stamp.
+
+    Samples without these joints are left out.
+    """
+    stamps, places = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    for _, block in BagReader(Path(path)).columns():
+        if isinstance(block, EncoderBlock) and set(joints) <= set(block.names):
+            stamps.append(block.stamps_ns)
+            places.append(block.positions[:, [block.names.index(name) for name in joints]])
+    stamp, place = np.concatenate(stamps), np.concatenate(places)
+    order = np.argsort(stamp, kind="stable")
+    return stamp[order], place[order]

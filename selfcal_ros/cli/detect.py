@@ -10,7 +10,10 @@ from selfcal_ros.cli.solve import node_settings
 from selfcal_ros.cli.terminal import add_json, say
 
 if TYPE_CHECKING:
+    from collections import Counter
+
     from selfcal_ros.collection.settings.detector import DetectorSettings
+    from selfcal_ros.vision.exposures import ImageDetector
 
 HELP = "find the marks in the images of a bag"
 SHOWN = 5
@@ -20,7 +23,11 @@ SHOWN = 5
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("bag", metavar="BAG", help="bag with stage/image or "
-                        "stage/image/compressed")
+                        "stage/image/compressed; with --positions the folder of image files")
+    parser.add_argument("--positions", metavar="FILE.csv", help="table of the image files and "
+                        "indicated positions: file, view, x, y (m)")
+    parser.add_argument("--plan", metavar="PLAN.yaml", help="plan with plate and views, needed "
+                        "with --positions")
     parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
                         "create: the detections and all other topics, without the images")
     add_options(parser)
@@ -67,8 +74,11 @@ def run(args: argparse.Namespace) -> int:
 
     settings = settings_of(args)
     detector = ImageDetector(settings, args.params or "options")
-    bag = ImageBag(Path(args.bag), args.namespace)
-    problems = bag.write_detected(args.output, detector.take, settings.frame_id)
+    if args.positions:
+        problems = _from_files(args, detector, settings.frame_id)
+    else:
+        problems = ImageBag(Path(args.bag), args.namespace).write_detected(
+            args.output, detector.take, settings.frame_id)
     truth = Path(args.bag, TRUTH_FILE)
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
@@ -79,6 +89,20 @@ def run(args: argparse.Namespace) -> int:
     say(args, text_of(args.output, found),
         {"bag": args.output, "counts": found, "problems": dict(problems)})
     return 0
+
+
+def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str) -> "Counter[str]":
+    """Write a bag from image files and a table of positions; return problems."""
+    from selfcal_ros.bagio.pictures import read_positions, write_pictures
+    from selfcal_ros.errors import InputError
+    from selfcal_ros.files import read_yaml
+    from selfcal_ros.model.view import plan_from_dict
+
+    if not args.plan:
+        raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
+    plan = plan_from_dict(read_yaml(args.plan), args.plan)
+    return write_pictures(Path(args.bag), read_positions(args.positions, plan), plan, args.output,
+                          detect=detector.take_file, frame_id=frame)
 
 
 def text_of(output: str, found: dict[str, int]) -> str:

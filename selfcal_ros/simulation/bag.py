@@ -9,9 +9,12 @@ import numpy as np
 
 from selfcal_ros import topics
 from selfcal_ros.bagio.offline import TRUTH_FILE
+from selfcal_ros.bagio.pictures import COLUMNS
 from selfcal_ros.bagio.writer import BagWriter, new_bag
+from selfcal_ros.collection import inputs
 from selfcal_ros.collection.inputs import Command, Detection
-from selfcal_ros.files import write_json
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import write_json, write_text
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.json_form import plain
 from selfcal_ros.simulation.cell import Event
@@ -27,6 +30,7 @@ QOS = {
     topics.COMMAND_TOPIC: topics.qos_profile(reliable=True, transient_local=True, depth=64),
 }
 IMAGE_TOPIC = topics.IMAGE_TOPICS["raw"]
+POSITIONS_FILE = "positions.csv"
 IMAGES = 0x1D
 """Part of the seed of the images."""
 
@@ -70,6 +74,43 @@ def _write(simulation: Simulation, path: Path,
                     cell=asdict(simulation.settings), spread=asdict(simulation.spread),
                     **({"camera": asdict(simulation.camera)} if simulation.camera else {}))
         return writer.counts
+
+
+def write_files(simulation: Simulation, path: str | Path, *,
+                progress: Callable[[int, int], None] = lambda done, total: None) -> dict[str, int]:
+    """Write the images of a simulated camera as PNG files, with positions.csv and truth.json.
+
+    Raises
+    ------
+    InputError
+        If the cell has no camera, or the folder exists or cannot be written.
+    """
+    from PIL import Image  # needed for files alone
+
+    if simulation.camera is None:
+        raise InputError("SIM.yaml", "the cell has no camera", "add the key 'camera'")
+    truth, arrivals, _ = simulation.run()
+    rng = np.random.default_rng((simulation.seed, simulation.noise_seed or 0, IMAGES))
+    view, last, rows = "", inputs.EncoderSample(0, (), (0.0, 0.0)), [",".join(COLUMNS)]
+    with new_bag(path) as folder:
+        folder.mkdir()
+        for number, (_, event) in enumerate(arrivals):
+            if isinstance(event, inputs.Command) and event.view is not None:
+                view = event.view.name
+            elif isinstance(event, inputs.EncoderSample):
+                last = event
+            elif isinstance(event, Exposure):
+                name = f"{len(rows):05}.png"
+                Image.fromarray(simulation.camera.image(
+                    event.offsets, rng, angles=event.angle)).save(folder / name)
+                rows.append(f"{name},{view},{last.positions[0]!r},{last.positions[1]!r}")
+            if number % 1000 == 0:
+                progress(number, len(arrivals))
+        write_text(folder / POSITIONS_FILE, "\n".join(rows) + "\n")
+        write_truth(folder / TRUTH_FILE, truth, seed=simulation.seed,
+                    noise_seed=simulation.noise_seed, cell=asdict(simulation.settings),
+                    spread=asdict(simulation.spread), camera=asdict(simulation.camera))
+    return {"images": len(rows) - 1}
 
 
 def image_fields(exposure: Exposure, camera: Camera, rng: np.random.Generator,

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -35,26 +36,33 @@ class Exposure:
 
 def exposures(truth: Truth, plan: Plan, camera: Camera,
               events: Iterable[Event]) -> Iterator[Event | Exposure]:
-    """Yield `events` with an exposure instead of each grid detection, which names its mark.
+    """Yield `events` with an exposure for all grid detections of a stamp, which name their marks.
 
-    The detected mark is at its offset; the others lie around it as on the plate, seen through the
-    same microscope.
+    The detected marks are at their offsets; the others lie around the first one as on the plate,
+    seen through the same microscope.
     """
     (hx, hy), reach = truth.artifact.half, camera.reach_m
     m, n = (side.ravel() for side in np.mgrid[-hx:hx + 1, -hy:hy + 1])
     place, index, angle = np.zeros((2, 0)), -1, 0.0
-    for event in events:
-        if isinstance(event, Command) and event.view is not None and event.view_index != index:
-            index = event.view_index
-            view = truth.placed_as(index, event.view)
-            place, _ = physics.mark_places(truth, index, view, (m, n))
-            angle = float(view.rotation_rad + truth.phi_rad[index])
-        if isinstance(event, Detection) and event.kind == Kind.GRID:
-            own = place[:, (event.m + hx) * (2 * hy + 1) + event.n + hy]
-            away = place - own[:, None]
-            near = np.hypot(*away) < reach
-            offset = np.array([[event.offset_x], [event.offset_y]])
-            yield Exposure(event.stamp_ns, offset + physics.seen_offset(truth, away[:, near]),
-                           angle)
-        else:
-            yield event
+    for _, group in groupby(events, key=lambda event: (event.stamp_ns, _is_grid(event))):
+        found = list(group)
+        for event in found:
+            if isinstance(event, Command) and event.view is not None and event.view_index != index:
+                index = event.view_index
+                view = truth.placed_as(index, event.view)
+                place, _ = physics.mark_places(truth, index, view, (m, n))
+                angle = float(view.rotation_rad + truth.phi_rad[index])
+        seen = {(event.m + hx) * (2 * hy + 1) + event.n + hy: (event.offset_x, event.offset_y)
+                for event in found if isinstance(event, Detection) and _is_grid(event)}
+        if not seen:
+            yield from found
+            continue
+        first = next(iter(seen))
+        away = place - place[:, [first]]
+        offsets = np.array([seen[first]]).T + physics.seen_offset(truth, away)
+        offsets[:, list(seen)] = np.array(list(seen.values())).T
+        yield Exposure(found[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle)
+
+
+def _is_grid(event: Event) -> bool:
+    return isinstance(event, Detection) and event.kind == Kind.GRID

@@ -160,15 +160,17 @@ class Camera:
         from scipy import ndimage  # half a second, which stage_simulator saves
 
         column, row = round(u), round(v)
+        top, left = row - half, column - half
+        rows = slice(max(top, 0), min(top + 2 * half + 1, self.height))
+        columns = slice(max(left, 0), min(left + 2 * half + 1, self.width))
+        if rows.start >= rows.stop or columns.start >= columns.stop:
+            return
         step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
         b, a = np.meshgrid(step - (v - row), step - (u - column), indexing="ij")
         cosine, sine = np.cos(angle), np.sin(angle)
         cover = np.clip(0.5 + FINE * inside(cosine * a + sine * b, cosine * b - sine * a), 0, 1)
         cover = ndimage.gaussian_filter(cover, self.blur_px * FINE, truncate=5.0, mode="nearest")
         pixels = cover.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean(axis=(1, 3))
-        top, left = row - half, column - half
-        rows = slice(max(top, 0), max(min(top + 2 * half + 1, self.height), 0))
-        columns = slice(max(left, 0), max(min(left + 2 * half + 1, self.width), 0))
         grey[rows, columns] += contrast * pixels[
             rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
 

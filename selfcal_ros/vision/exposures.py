@@ -2,6 +2,7 @@
 """A series of images into detections, the same live and from a bag; everything is counted."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.detector import MarkDetector
-from selfcal_ros.vision.images import Picture, picture_of
+from selfcal_ros.vision.images import Picture, decoded, picture_of
 
 
 @dataclass
@@ -68,16 +69,19 @@ class ImageDetector:
             If the image cannot be used, which is counted: unknown encoding, damaged, another size
             than that of the first one, no later stamp than the one before.
         """
+        return self._detect(lambda: picture_of(message), stamp_ns(message))
+
+    def take_file(self, data: bytes, name: str, stamp: int) -> list[Detection]:
+        """Return the detections of an image file exposed at `stamp`, ns; raises like `take`."""
+        return self._detect(lambda: decoded(data, name), stamp)
+
+    def _detect(self, decode: Callable[[], Picture], stamp: int) -> list[Detection]:
         try:
-            stamp, picture = stamp_ns(message), picture_of(message)
+            picture = decode()
             self._check(stamp, picture)
         except InputError:
             self.counts.refused += 1
             raise
-        return self.detect(picture, stamp)
-
-    def detect(self, picture: Picture, stamp: int) -> list[Detection]:
-        """Return the detections of a picture exposed at `stamp`, ns."""
         self._shape, self._last_ns = picture.values.shape, stamp
         found, rejected = self._detector.detections(picture, stamp)
         self.counts.images += 1

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from PIL import Image
@@ -197,3 +198,101 @@ def test_topics_of_foreign_types_are_kept(bag, tmp_path):
     assert detect(tmp_path / "foreign.mcap", tmp_path / "found") == 0
     assert contents(tmp_path / "found", "/odd") == [(8, b"\0\1\0\0" + bytes(8))]
     assert "/odd" in (tmp_path / "found" / "metadata.yaml").read_text()
+
+
+def pictures(tmp_path, **changes):
+    """Write the simulated images as PNG files; return their folder and the plan."""
+    data = yaml.safe_load(SIM) | changes
+    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(data))
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(data["plan"]))
+    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "pictures"),
+                 "--png"]) == 0
+    return tmp_path / "pictures"
+
+
+def test_a_folder_of_files_gives_the_detections_of_the_bag(bag, tmp_path):
+    folder = pictures(tmp_path)
+    assert len(list(folder.glob("*.png"))) == 140
+    assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
+                  "--plan", str(tmp_path / "plan.yaml")) == 0
+    assert detect(bag, tmp_path / "of_bag") == 0
+    values = [[own_values(data) for _, data in contents(
+        tmp_path / name, f"/{DETECTION_TOPIC}")] for name in ("found", "of_bag")]
+    assert values[0] == values[1]
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    result, truth = read_json(tmp_path / "R.json"), read_json(folder / "truth.json")
+    for axis in ("gx", "gy"):
+        away = np.array(result["error_map"][axis], float) - truth[axis]
+        assert (np.abs(away) < 5 * np.array(result["error_map"][f"u_{axis}"], float)).all()
+
+
+def own_values(data):
+    kind = "selfcal_msgs/msg/MarkDetection"
+    message = store_with(kind).deserialize_cdr(data, kind)
+    return message.offset_x, message.offset_y, message.sigma, message.score
+
+
+@pytest.mark.parametrize("table, problem", [
+    ("file,view,x\n", "no column 'y'; begin with the line file,view,x,y"),
+    ("file,view,x,y\na.png,tilted,0,0\n", ":2: the plan has no view 'tilted'"),
+    ("file,view,x,y\n\na.png,shift,0,far\n", ":3: 'far' is no position"),
+    ("file,view,x,y\na.png,shift,nan,0\n", ":2: 'nan' is no position"),
+    ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell")])
+def test_a_bad_table_is_refused_with_its_line(tmp_path, capsys, table, problem):
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
+    (tmp_path / "p.csv").write_text(table)
+    assert detect(tmp_path, tmp_path / "found", "--positions", str(tmp_path / "p.csv"), "--plan",
+                  str(tmp_path / "plan.yaml")) == 2
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "found").exists()
+
+
+def test_missing_and_damaged_files_are_one_line_each(tmp_path, capsys):
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
+    (tmp_path / "p.csv").write_text("# by hand\nfile,view,x,y\na.png,shift,0,0\nb.png,shift,0,0\n")
+    (tmp_path / "a.png").write_bytes(b"no image")
+    assert detect(tmp_path, tmp_path / "found", "--positions", str(tmp_path / "p.csv"), "--plan",
+                  str(tmp_path / "plan.yaml")) == 0
+    printed = capsys.readouterr()
+    assert len(printed.err.splitlines()) == 2
+    assert "a.png: cannot be decoded as an image" in printed.err
+    assert "b.png" in printed.err and "0 marks in 0 images" in printed.out
+
+
+def test_positions_without_a_plan_are_refused(bag, tmp_path, capsys):
+    assert detect(bag, tmp_path / "found", "--positions", "p.csv") == 2
+    assert "--positions: the plan is missing; give --plan PLAN.yaml" in capsys.readouterr().err
+
+
+def test_a_cell_without_a_camera_has_no_png_files(tmp_path, capsys):
+    (tmp_path / "sim.yaml").write_text(SIM.partition("camera:")[0])
+    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "p"), "--png"]) == 2
+    assert "the cell has no camera" in capsys.readouterr().err
+
+
+SEVERAL = """
+plan:
+  plan_id: several
+  artifact: {grid_size: 5, grid_pitch: 2.0e-4, angular_count: 0}
+  image: {nx: 3, ny: 3}
+  views: [{name: identity, repeats: 2}, {name: rot90, rotation_deg: 90, repeats: 2}]
+seed: 3
+truth: {t: 1.0e-5, phi: 1.0e-4, g: 2.0e-7}
+noise: {sigma_xy: 1.0e-8}
+camera: {width: 144, height: 144, pixel_size: 4.0e-6, mark_size: 60.0e-6, turn: 90.0, blur: 0.9,
+  distortion: 0.01}
+"""
+
+
+def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
+    """A camera turned by a quarter, with 1 % distortion in the corners."""
+    (tmp_path / "sim.yaml").write_text(SEVERAL)
+    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
+    assert main(["detect", str(tmp_path / "bag"), "-o", str(tmp_path / "found"), "--pixel-size",
+                 "4e-6", "--mark-size", "60e-6", "--turn", "90"]) == 0
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    result, truth = read_json(tmp_path / "R.json"), read_json(tmp_path / "bag" / "truth.json")
+    assert result["observability"]["identifiable"] and result["rejected"] == {}
+    for axis in ("gx", "gy"):
+        away = np.array(result["error_map"][axis], float) - truth[axis]
+        assert np.abs(away).max() < 0.2 * np.abs(truth[axis]).max()

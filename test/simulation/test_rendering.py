@@ -65,3 +65,8 @@ def test_a_corner_is_turned_counter_clockwise_with_the_plate():
 def test_dirt_is_dark_and_counted_on_average():
     spotted = grey(replace(PLAIN, dirt=5.0, contrast=0.0))
     assert 0 < (spotted < 0.4).sum() < spotted.size / 4
+
+
+def test_a_mark_outside_of_the_image_does_not_show():
+    for away in ((1e-3, 0.0), (-1e-3, 1e-3), (0.0, -1e-3)):
+        assert (grey(PLAIN, np.array([away]).T) == grey(replace(PLAIN, contrast=0.0))).all()

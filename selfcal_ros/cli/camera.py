@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal camera init``: size of the pixels, turn and mirror from a few moves of the stage."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.errors import InputError, NoDataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from selfcal_ros.vision.camera_pose import CameraPose
+    from selfcal_ros.vision.exposures import ImageDetector
+
+HELP = "find the size of the pixels, turn and mirror of a camera"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    init = parser.add_subparsers(dest="camera_verb", metavar="init", required=True).add_parser(
+        "init", help="from a few moves of the stage", description="Follows marks in images taken "
+        "while the stage stands at a few positions in x and y, less than half the distance of two "
+        "marks apart, and writes the parameters of mark_detector.")
+    init.add_argument("bag", metavar="BAG", help="bag with images and joint states; with "
+                      "--positions the folder of image files")
+    init.add_argument("--positions", metavar="FILE.csv",
+                      help="table of the image files and indicated positions: file, x, y (m)")
+    init.add_argument("-o", "--output", metavar="NODES.yaml", required=True,
+                      help="ROS parameter file to write")
+    init.add_argument("--mark", choices=("disc", "ring", "cross", "corner"), default="disc",
+                      help="kind of mark (default: disc)")
+    init.add_argument("--mark-size", type=float, metavar="M", required=True,
+                      help="size of the marks on the plate, m (as in selfcal detect)")
+    init.add_argument("--mark-pixels", type=float, metavar="PX", required=True,
+                      help="size of a mark in the image, pixels, to a tenth")
+    init.add_argument("--polarity", choices=("dark", "bright"), default="dark",
+                      help="marks on their ground (default: dark)")
+    init.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
+                      default="microscope_moves", help="what moves (default: microscope_moves)")
+    add_json(init)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Follow the marks, print the camera, write the parameters."""
+    import math
+
+    from selfcal_ros.collection.settings.detector import DetectorSettings
+    from selfcal_ros.files import write_yaml
+    from selfcal_ros.model.readings import Sense
+    from selfcal_ros.vision.camera_pose import camera_pose
+    from selfcal_ros.vision.exposures import ImageDetector
+
+    detector = ImageDetector(DetectorSettings.checked({
+        "pixel_size": 1.0, "mark_size": float(args.mark_pixels), "mark": args.mark,
+        "polarity": args.polarity}, "--mark-pixels"), "--mark-pixels")  # offsets in pixels
+    positions, images = (_of_files if args.positions else _of_bag)(args, detector)
+    found = camera_pose(positions, images, Sense(args.sense))
+    values = {"pixel_size": found.pixel_size_m, "turn": math.degrees(found.turn_rad),
+              "mirror": found.mirror, "mark": args.mark, "mark_size": args.mark_size,
+              "polarity": args.polarity}
+    write_yaml(args.output, {"mark_detector": {"ros__parameters": values}})
+    say(args, _text(found, args.output), {"file": args.output, **values, "u_pixel_size":
+        found.u_pixel_size_m, "u_turn": math.degrees(found.u_turn_rad), "sheared": found.sheared,
+        "u_sheared": found.u_sheared, "noise_px": found.noise_px})
+    return 0
+
+
+def _text(found: "CameraPose", output: str) -> str:
+    import math
+
+    from selfcal_ros.units import M_PER_UM
+
+    return (f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
+            f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
+            f"(u {math.degrees(found.u_turn_rad):.1g}°), "
+            f"{'mirrored' if found.mirror else 'not mirrored'}; axes unequal or sheared by "
+            f"{found.sheared:.1g} (u {found.u_sheared:.1g}); noise of a mark "
+            f"{found.noise_px:.2g} pixels")
+
+
+def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
+            ) -> "tuple[np.ndarray, list[np.ndarray]]":
+    """Return stage positions and marks of each image of a bag."""
+    import numpy as np
+
+    from selfcal_ros.bagio.images import ImageBag, encoder_track
+
+    stamps, track = encoder_track(args.bag)
+    exposed, images = [], []
+    for item in ImageBag(Path(args.bag)).items():
+        if item.image is not None:
+            found = detector.take(item.image)
+            if found:
+                exposed.append(found[0].stamp_ns)
+                images.append(np.array([(mark.offset_x, mark.offset_y) for mark in found]))
+    if not exposed or not len(stamps):
+        raise NoDataError(args.bag, "no image with a mark, or no stage/joint_states",
+                          "check mark, polarity and --mark-pixels")
+    if min(exposed) < stamps[0] or max(exposed) > stamps[-1]:
+        raise InputError(args.bag, "an image was taken before the first or after the last sample "
+                         "of the encoders", "record the joint states around all images")
+    return np.stack([np.interp(exposed, stamps, axis) for axis in track.T], axis=1), images
+
+
+def _of_files(args: argparse.Namespace, detector: "ImageDetector",
+              ) -> "tuple[np.ndarray, list[np.ndarray]]":
+    """Return stage positions and marks of each image of a folder."""
+    import numpy as np
+
+    from selfcal_ros.bagio.pictures import read_positions
+    from selfcal_ros.files import read_bytes
+
+    positions, images = [], []
+    for number, row in enumerate(read_positions(args.positions, None)):
+        found = detector.take_file(read_bytes(Path(args.bag) / row.file), row.file, number)
+        if found:
+            positions.append((row.x_m, row.y_m))
+            images.append(np.array([(mark.offset_x, mark.offset_y) for mark in found]))
+    return np.array(positions).reshape(-1, 2), images

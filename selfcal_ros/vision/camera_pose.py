@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Size of the pixels, turn and mirror of a camera, from marks seen while the stage moves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.model.readings import Sense
+
+NOT_SIMILAR = 0.02
+"""Relative difference of the two axes, or shear, above which a camera is refused."""
+LEAST_SPAN = 0.1
+"""Smallest extent of the positions over the largest one."""
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """A camera as the parameters of mark_detector describe it, with standard uncertainties.
+
+    Attributes
+    ----------
+    pixel_size_m, u_pixel_size_m : float
+        Side of a pixel on the plate.
+    turn_rad, u_turn_rad : float
+        Turn of the image to the stage axes.
+    mirror : bool
+        Whether the image is mirrored.
+    sheared, u_sheared : float
+        Relative difference from a similarity: unequal axes and shear.
+    noise_px : float
+        Standard deviation of a coordinate of a mark.
+    """
+
+    pixel_size_m: float
+    u_pixel_size_m: float
+    turn_rad: float
+    u_turn_rad: float
+    mirror: bool
+    sheared: float
+    u_sheared: float
+    noise_px: float
+
+
+def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the number of the track of each mark, image by image.
+
+    A mark continues the nearest one of the image before, if it has moved by less than half the
+    smallest distance between two marks; a single mark per image is always the same one.
+
+    Parameters
+    ----------
+    images : sequence of float arrays (k, 2)
+        Places of the marks, px.
+    """
+    apart = [float(np.hypot(*(found[i] - found[j]))) for found in images
+             for i in range(len(found)) for j in range(i)]
+    limit = min(apart) / 2 if apart else np.inf
+    numbers: list[np.ndarray] = []
+    count, before, known = 0, np.zeros((0, 2)), np.zeros(0, dtype=int)
+    for found in images:
+        mine = np.full(len(found), -1)
+        for index, place in enumerate(found):
+            away = np.hypot(*(before - place).T)
+            if len(away) and away.min() < limit:
+                mine[index] = known[away.argmin()]
+            else:
+                mine[index], count = count, count + 1
+        numbers.append(mine)
+        if len(found):
+            before, known = found, mine
+    return numbers
+
+
+def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sense) -> CameraPose:
+    """Return the camera that sees marks at these places while the stage is at `positions`.
+
+    Parameters
+    ----------
+    positions : float array (n, 2)
+        Indicated positions of the stage, m.
+    images : sequence of n float arrays (k, 2)
+        Places of the marks, px: to the right of and above the centre of the image.
+    sense : Sense
+        What moves.
+
+    Raises
+    ------
+    NoDataError
+        If too few marks were followed.
+    InputError
+        If the stage moved along one line, or the image is no similar image of the motion.
+    """
+    number = np.concatenate([np.zeros(0, int), *tracks(images)])
+    stage = np.repeat(positions, [len(found) for found in images], axis=0)
+    place = np.concatenate([np.zeros((0, 2)), *images])
+    followed = np.bincount(number)[number] > 1 if len(number) else np.zeros(0, bool)
+    number, stage, place = number[followed], stage[followed], place[followed]
+    _, number = np.unique(number, return_inverse=True)
+    count = number.max(initial=-1) + 1
+    if len(number) < count + 3:
+        raise NoDataError("camera", f"{len(number)} readings of {count} marks that were followed",
+                          "move the stage in x and y by less than half the distance of two marks, "
+                          "so that marks stay in the image")
+    stage = stage - (np.stack([np.bincount(number, axis) for axis in stage.T])
+                     / np.bincount(number)).T[number]
+    place = place - (np.stack([np.bincount(number, axis) for axis in place.T])
+                     / np.bincount(number)).T[number]
+    span = np.linalg.svd(stage, compute_uv=False)
+    if span[1] < LEAST_SPAN * span[0]:
+        raise InputError("camera", "the stage moved along one line only",
+                         "move it in x and in y")
+    by_stage = np.linalg.lstsq(stage, place, rcond=None)[0].T  # px per m
+    residual = place - stage @ by_stage.T
+    noise = float(np.sqrt(np.square(residual).sum() / (2 * (len(number) - count - 2))))
+    covariance = np.kron(np.eye(2), np.linalg.inv(stage.T @ stage)) * noise ** 2
+    return _similar(by_stage, covariance, sense, noise)
+
+
+def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: float,
+             ) -> CameraPose:
+    """Return the similarity in the change of places (px) by the stage (m), with uncertainties."""
+    sign = 1 if sense is Sense.PLATE_MOVES else -1
+    mirror = bool(np.linalg.det(by_stage) < 0)
+
+    def parts(matrix: np.ndarray) -> np.ndarray:
+        """Return size, turn, and the two parts that are no similarity, of m per px."""
+        camera = sign * np.linalg.inv(matrix)
+        if mirror:
+            camera = camera * np.array([-1.0, 1.0])
+        (a, b), (c, d) = camera
+        size = np.hypot(a + d, c - b) / 2
+        return np.array([size, np.arctan2(c - b, a + d), (a - d) / 2 / size, (b + c) / 2 / size])
+
+    found = parts(by_stage)
+    step = 1e-6 * np.abs(by_stage).max()
+    jacobian = np.empty((4, 4))
+    for index in range(4):
+        change = np.zeros(4)
+        change[index] = step
+        both = [parts(by_stage + way * change.reshape(2, 2)) for way in (1, -1)]
+        differ = both[0] - both[1]
+        differ[1] = np.remainder(differ[1] + np.pi, 2 * np.pi) - np.pi
+        jacobian[:, index] = differ / (2 * step)
+    u = np.sqrt(np.diagonal(jacobian @ covariance @ jacobian.T))
+    sheared = float(np.hypot(*found[2:]))
+    if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
+        raise InputError("camera", f"the image of the motion is sheared by {sheared:.1%}",
+                         "check that the moves are shorter than half the distance of two marks, "
+                         "and that the encoder axes are those of the camera's stage")
+    return CameraPose(float(found[0]), float(u[0]), float(found[1]), float(u[1]), mirror, sheared,
+                      float(u[2:].max()), noise)

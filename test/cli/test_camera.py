@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal camera init``: the camera of a simulated cell, from a bag and from files."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.cli.main import main
+from selfcal_ros.collection.inputs import EncoderSample
+from selfcal_ros.collection.settings.nodes import overrides_in
+from selfcal_ros.files import read_yaml
+from selfcal_ros.messages import from_model
+from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.topics import ENCODER_TOPIC, IMAGE_TOPICS, IMAGE_TYPES, INPUT_TOPICS
+
+MOVES = [(0.0, 0.0), (4e-5, 0.0), (4e-5, 3e-5), (0.0, 5e-5), (-5e-5, -2e-5)]
+MARKS = np.array([[-1e-4, 1e-4, 1e-4], [-9e-5, -7e-5, 9e-5]])
+OPTIONS = ["--mark-size", "50e-6", "--mark-pixels", "19"]
+
+
+def views(camera, sign=-1):
+    """Return an image at each position; the marks move against the microscope (sign -1)."""
+    rng = np.random.default_rng(2)
+    return [camera.image(MARKS + sign * np.array([move]).T, rng) for move in MOVES]
+
+
+def bag_of(path, camera, sign=-1):
+    with BagWriter(path) as writer:
+        writer.add_topic(f"/{ENCODER_TOPIC}", INPUT_TOPICS[ENCODER_TOPIC], [])
+        writer.add_topic(f"/{IMAGE_TOPICS['raw']}", IMAGE_TYPES["raw"], [])
+        for number, (move, values) in enumerate(zip(MOVES, views(camera, sign), strict=True), 1):
+            for stamp in (number * 10**9 - 10**7, number * 10**9 + 10**7):
+                writer.write(f"/{ENCODER_TOPIC}", from_model.joint_state(EncoderSample(
+                    stamp, ("theta", "y", "x"), (0.0, move[1], move[0])), "stage"), stamp)
+            writer.write(f"/{IMAGE_TOPICS['raw']}", from_model.image(
+                values, "mono8", number * 10**9, "camera"), number * 10**9)
+    return path
+
+
+def init(source, output, *more):
+    return main(["camera", "init", str(source), "-o", str(output), *OPTIONS, *more])
+
+
+@pytest.mark.parametrize("sense, sign", [("microscope_moves", -1), ("plate_moves", 1)])
+@pytest.mark.parametrize("turn, mirror", [
+    (0.0, False), (30.0, False), (-140.0, False), (0.0, True), (75.0, True), (180.0, True)])
+def test_the_camera_is_found_within_its_uncertainty(tmp_path, capsys, turn, mirror, sense, sign):
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=turn, mirror=mirror)
+    bag_of(tmp_path / "bag", camera, sign)
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml", "--json", "--sense", sense) == 0
+    said = json.loads(capsys.readouterr().out)
+    given = overrides_in(read_yaml(tmp_path / "nodes.yaml"), "mark_detector", "nodes.yaml")
+    assert given["mirror"] is mirror and given["mark_size"] == 50e-6
+    assert 0 < said["u_pixel_size"] < 1e-3 * 2.6e-6 and 0 < said["u_turn"] < 0.05
+    assert abs(given["pixel_size"] - 2.6e-6) < 5 * said["u_pixel_size"]
+    away = (given["turn"] - turn + 180) % 360 - 180
+    assert abs(away) < 5 * said["u_turn"]
+    assert said["sheared"] < 5 * said["u_sheared"]
+
+
+def test_a_folder_of_files_with_positions_serves_as_well(tmp_path):
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=30.0)
+    bag_of(tmp_path / "bag", camera)
+    rows = ["file,x,y"]
+    for number, (move, values) in enumerate(zip(MOVES, views(camera), strict=True)):
+        Image.fromarray(values).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,{move[0]},{move[1]}")
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    assert init(tmp_path / "bag", tmp_path / "a.yaml") == 0
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 0
+    found = [read_yaml(tmp_path / name)["mark_detector"]["ros__parameters"]
+             for name in ("a.yaml", "b.yaml")]
+    assert found[0].pop("pixel_size") == pytest.approx(found[1].pop("pixel_size"), rel=1e-9)
+    assert found[0].pop("turn") == pytest.approx(found[1].pop("turn"), abs=1e-9)
+    assert found[0] == found[1]
+
+
+def test_the_detector_takes_the_file_that_it_writes(tmp_path):
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=30.0, mirror=True)
+    bag_of(tmp_path / "bag", camera)
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 0
+    assert main(["detect", str(tmp_path / "bag"), "-o", str(tmp_path / "found"), "--params",
+                 str(tmp_path / "nodes.yaml")]) == 0
+
+
+def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.MOVES", [(0.0, 0.0), (3e-5, 0.0), (6e-5, 0.0)])
+    bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
+    assert "the stage moved along one line only; move it in x and in y" in capsys.readouterr().err
+    assert not (tmp_path / "nodes.yaml").exists()
+
+
+def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
+    """The encoder of y counts half: the image of the motion is no similar one."""
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
+    rows = ["file,x,y"]
+    for number, (move, values) in enumerate(zip(MOVES, views(camera), strict=True)):
+        Image.fromarray(values).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,{move[0]},{move[1] / 2}")
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 2
+    assert "the image of the motion is sheared by 33" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count, code", [(0, 4), (1, 4)])
+def test_too_few_images_are_said_so(tmp_path, capsys, count, code):
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
+    rows = ["file,x,y"]
+    for number in range(count):
+        Image.fromarray(views(camera)[0]).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,0,0")
+    (tmp_path / "p.csv").write_text("\n".join(rows) + "\n")
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == code
+    assert "move the stage in x and y" in capsys.readouterr().err
