@@ -9,11 +9,14 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import yaml
 
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
 from selfcal_ros.cli.replay import domain, process
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
@@ -22,11 +25,14 @@ from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.units import PPM_PER_ONE, URAD_PER_RAD
+from selfcal_ros.vision.exposures import ImageDetector
 
 ROOT = Path(__file__).parents[1]
 BAGS = ROOT / "bags"
 WRITTEN = {"hu_exact": "hu_exact.yaml", "fig10_faults": "fig10_faults.yaml",
-           "deficient": "deficient.yaml"}
+           "deficient": "deficient.yaml", "camera": "camera.yaml"}
+DETECT = {"camera": {"pixel_size": 6.0e-6, "mark_size": 72.0e-6, "turn": 1.5}}
+"""Parameters of mark_detector for bags of images."""
 RECORDED = "hu_noise"
 PARAMS = ROOT / "config" / "params" / "simulated_cell.yaml"
 PLAN = ROOT / "config" / "plans" / "hu_repeated.yaml"
@@ -55,8 +61,22 @@ def record(bag: Path) -> None:
     truth.replace(bag / TRUTH_FILE)
 
 
+def of_images(name: str) -> dict:
+    """Return what the detector must find in a bag of images."""
+    detector = ImageDetector(DetectorSettings.checked(DETECT[name], name))
+    with TemporaryDirectory() as folder:
+        ImageBag(BAGS / name).write_detected(Path(folder, name), detector.take, "stage")
+        measurements, _, lost, _ = collect_bag(Path(folder, name), CollectorSettings.checked(
+            {}, "defaults"))
+    return {**detector.counts.values(), "rejected": measurements.all_rejected(), "lost": lost}
+
+
 def entry(name: str, made: str) -> dict:
     """Return the manifest entry of a bag: digest, how it was made, what it must give."""
+    about = {"sha256": bag_input(BAGS / name)["sha256"], "made": made,
+             "truth": f"{name}/truth.json"}
+    if name in DETECT:
+        return about | {"detect": DETECT[name], "expected": of_images(name)}
     measurements, _, lost, _ = collect_bag(BAGS / name, CollectorSettings.checked(
         {}, "defaults"))
     expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
@@ -68,8 +88,7 @@ def entry(name: str, made: str) -> dict:
                      "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
     except NotIdentifiableError as error:
         expected |= {"identifiable": False, "deficiency": error.observability.deficiency}
-    return {"sha256": bag_input(BAGS / name)["sha256"], "made": made, "truth": f"{name}/truth.json",
-            "expected": expected}
+    return about | {"expected": expected}
 
 
 def main() -> None:

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import yaml
 
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.vision.exposures import ImageDetector
 from test.support.options import BARE
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -30,7 +33,30 @@ def test_every_bag_is_in_the_manifest_and_they_stay_small():
     assert sum(path.stat().st_size for path in BAGS.rglob("*") if path.is_file()) < 15e6
 
 
-@pytest.mark.parametrize("name", MANIFEST)
+def images(name, folder):
+    """Return the detector's counts, and the bag of its detections in the images of a bag."""
+    detector = ImageDetector(DetectorSettings.checked(MANIFEST[name]["detect"], name))
+    ImageBag(BAGS / name).write_detected(folder / name, detector.take, "stage")
+    return detector.counts.values(), folder / name
+
+
+OF_IMAGES = [name for name, entry in MANIFEST.items() if "detect" in entry]
+
+
+@pytest.mark.parametrize("name", OF_IMAGES)
+def test_images_give_the_marks_and_these_the_truth(name, tmp_path):
+    entry = MANIFEST[name]
+    assert bag_input(BAGS / name)["sha256"] == entry["sha256"]
+    counts, found = images(name, tmp_path)
+    measurements, _, lost, _ = collect_bag(found, CollectorSettings.checked({}, "defaults"))
+    assert counts | {"rejected": measurements.all_rejected(), "lost": lost} == entry["expected"]
+    emap, truth = calibrate(measurements).error_map, read_truth(BAGS / name)
+    for values, u, true in ((emap.gx, emap.u_gx, truth["gx"]), (emap.gy, emap.u_gy, truth["gy"])):
+        assert (np.abs(values - np.array(true)) <= 5 * u).all()
+        assert u.max() < 0.1 * np.abs(true).max()
+
+
+@pytest.mark.parametrize("name", [name for name in MANIFEST if name not in OF_IMAGES])
 def test_bag_gives_what_the_manifest_says(name):
     entry = MANIFEST[name]
     assert bag_input(BAGS / name)["sha256"] == entry["sha256"]
