@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from PIL import Image
 
-from selfcal_ros.bagio.images import ImageBag
+from selfcal_ros.bagio.images.bags import ImageBag
 from selfcal_ros.bagio.schemas import build, store_with
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main
