@@ -19,6 +19,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
+    parser.add_argument("--details", metavar="DETAILS.yaml", help="add what a certificate states: "
+                        "laboratory, customer, item, conditions (docs/certificate.md), "
+                        "traceability, U of distances")
     for name, what in (("stage", "name of the stage"), ("serial-number", "its serial number"),
                        ("operator", "who calibrated it")):
         parser.add_argument(f"--{name}", metavar="TEXT", default="",
@@ -38,16 +41,23 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.reporting.summary.sections import summary_text
 
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
-    check_outputs([args.result, args.truth], [output, args.plot])
+    check_outputs([args.result, args.truth, args.details], [output, args.plot])
     check_name(output)
     result = result_from_dict(read_json(args.result), args.result)
     truth = read_truth(args.truth) if args.truth else None
+    more = [table_chapter(result)]
+    if args.details:
+        from selfcal_ros.files import read_yaml
+        from selfcal_ros.standards.chapter import certificate_chapter
+        from selfcal_ros.standards.details import details_from_dict
+        more.append(certificate_chapter(result, details_from_dict(read_yaml(args.details),
+                                                                  args.details)))
     with busy("drawing"):
         if args.plot:
             from selfcal_ros.reporting.figures.maps import map_picture
             from selfcal_ros.reporting.figures.paper import save_picture
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth, more=[table_chapter(result)],
+        write_report(result, output, truth=truth, more=more,
                      about={name: getattr(args, name) for name in ABOUT})
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))

@@ -166,7 +166,7 @@ def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[
     traceable = is_traceable(result)
     yield _dcc("statement", _content("name", "Metrological traceability"),
                _dcc("traceable", str(traceable).lower()),
-               _content("declaration", *_scale_texts(result)))
+               _content("declaration", *scale_texts(result)))
     verdict = result.verdict
     texts = [verdict.sentence or str(verdict.grade), *verdict.reasons]
     yield _dcc("statement", _content("name", "Agreement of readings and model"),
@@ -176,7 +176,8 @@ def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[
         yield _dcc("statement", _content("name", "Remark"), _content("declaration", remark["text"]))
 
 
-def _scale_texts(result: CalibrationResult) -> list[str]:
+def scale_texts(result: CalibrationResult) -> list[str]:
+    """Return what sets the scale of a map, and whether it is traceable."""
     reference = result.reference
     if not reference:
         return ["The scale of the map is a convention, relative to the encoders: no reference "
@@ -342,6 +343,13 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
         yield _result(f"Uncertainty budget: {quantity_text(budget)}", _dcc("list", *rows))
 
 
+def distance_text(stage: StageMap, a: float, b: float) -> str:
+    """Return the statement U = a + b L on distances in the field, a in m and b in m/m."""
+    return (f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
+            f"+ {b * UM_PER_M:.3g} µm/m · L, k = {stage.result.noise.k_xy:.3g}, 95.45 %: errors of "
+            "neighbouring nodes are correlated.")
+
+
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
     """Yield U of distances, a + b L, and the covariance of all nodes if requested."""
     emap, at = stage.error_map, stage.error_map.artifact
@@ -355,9 +363,7 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
             "text", f"The correlations between nodes are not known ({error.what})."))
         return
     yield _result("Expanded uncertainty of the distance L of two points, U = a + b L", _content(
-        "text", f"U of the distance of any two points of the field is at most {a * UM_PER_M:.3g} "
-        f"µm + {b * UM_PER_M:.3g} µm/m · L, k = {stage.result.noise.k_xy:.3g}, 95.45 %: errors of "
-        "neighbouring nodes are correlated."), _dcc(
+        "text", distance_text(stage, a, b)), _dcc(
             "list", _scalar("a", a, METRE), _scalar("b", b, ONE)))
     if not covariance:
         return

@@ -23,6 +23,7 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.standards.chapter import certificate_chapter
 from selfcal_ros.standards.dcc import DCC, SI, certificate, is_traceable
 from selfcal_ros.standards.details import details_from_dict
 
@@ -251,3 +252,23 @@ def test_the_verb_writes_refuses_and_ends_with_the_code_of_the_result(tmp_path, 
     assert error.count("\n") == 1 and "--not-qualified" in error
     assert main(["certificate", bad, str(DETAILS), "-o", out, "--not-qualified"]) == 5
     assert main(["certificate", good, str(DETAILS), "-o", good]) == 2
+
+
+def test_the_report_has_the_same_for_people(tmp_path, capsys):
+    result, page = str(tmp_path / "r.json"), tmp_path / "r.html"
+    write_json(result, result_to_dict(solved(CERTIFIED.at_temperature("21:.1:5e-7:5e-8"))))
+    assert main(["report", result, "--details", str(DETAILS), "-o", str(page)]) == 0
+    text = page.read_text()
+    for part in ("EX-2026-0042", "Example Calibration Laboratory", "temperature of the plate",
+                 "20.4", "used at 21 °C", "U of the distance L", "chromium on fused silica"):
+        assert part in text, part
+    assert main(["report", result, "-o", str(page)]) == 0
+    assert "EX-2026-0042" not in page.read_text()
+    bad = tmp_path / "d.yaml"
+    bad.write_text("item: {}")
+    assert main(["report", result, "--details", str(bad), "-o", str(page)]) == 2
+    assert "certificate: is missing" in capsys.readouterr().err
+    apart = solved()
+    chapter = certificate_chapter(replace(apart, views=()), details())
+    assert any("correlations between nodes are not known" in note
+               for section in chapter.sections for note in section.notes)

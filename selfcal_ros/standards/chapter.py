@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chapter of a report that has what a certificate states, for people."""
+
+from typing import Any
+
+from selfcal_ros.apply import StageMap
+from selfcal_ros.errors import InputError, printable
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.reporting.chapters import Chapter
+from selfcal_ros.reporting.summary.sections import Section
+from selfcal_ros.standards.dcc import distance_text, scale_texts
+
+
+def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> Chapter:
+    """Return the details of a certificate, its traceability, and U of distances.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        A calibration that identifies the stage.
+    details : dict
+        As `selfcal_ros.standards.details.details_from_dict` gives it.
+    """
+    sections = [_facts(title, details[name]) for title, name in (
+        ("Certificate", "certificate"), ("Laboratory", "laboratory"), ("Customer", "customer"),
+        ("Item", "item"))]
+    sections += [_table(title, details[name]) for title, name in (
+        ("Persons", "persons"), ("Conditions, u with k=1", "conditions"),
+        ("Equipment", "equipment"))]
+    try:
+        stage = StageMap(result)
+        distance = distance_text(stage, *stage.length_uncertainty())
+    except InputError as error:
+        distance = f"the correlations between nodes are not known ({printable(error.what)})"
+    sections += [
+        Section("Metrological traceability", notes=tuple(map(printable, scale_texts(result)))),
+        Section("Uncertainty of distances", notes=(distance,)),
+        Section("Remarks", notes=tuple(printable(item["text"]) for item in details["remarks"]))]
+    return Chapter("Certificate", sections=tuple(sections))
+
+
+def _facts(title: str, found: dict[str, Any]) -> Section:
+    return Section(title, tuple((key.replace("_", " "), printable(str(value)))
+                                for key, value in found.items()))
+
+
+def _table(title: str, rows: list[dict[str, Any]]) -> Section:
+    keys = tuple(dict.fromkeys(key for row in rows for key in row))
+    return Section(title, table=(
+        tuple(key.replace("_", " ") for key in keys),
+        *(tuple(printable(str(row.get(key, ""))) for key in keys) for row in rows))
+        if rows else ())
