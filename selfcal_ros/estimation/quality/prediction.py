@@ -25,7 +25,7 @@ from selfcal_ros.estimation.terms.ground import TermInputs, ground_of
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
 from selfcal_ros.estimation.terms.shapes import shapes_in_full
-from selfcal_ros.estimation.terms.visits import ViewVisits
+from selfcal_ros.estimation.terms.visits import ViewVisits, time_ranges
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.statistics import MANY_DOF
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
@@ -97,7 +97,7 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
             if column.term in OF_LINES:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1
-            row = -1 if shared else rows[column.view]
+            row = -1 if shared else _fitted_row(problem.ground, ground, rows, column.view)
             if row < 0 and not shared:
                 own.append(np.where(np.isfinite(column.size), column.size, 0.0) * block[None])
             elif (key := (column.term, row, column.component)) in at:
@@ -105,16 +105,25 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     return HeldReadings(grid, out, rows, np.concatenate(own), moved)
 
 
+def _fitted_row(fitted: TermInputs, held: TermInputs, rows: tuple[int, ...], first: int) -> int:
+    """Return the first view of a placing in the fit; -1 if no view of it was fitted."""
+    known = [rows[view] for view in held.members[first] if rows[view] >= 0]
+    return next(first for first, members in fitted.members.items()
+                if known[0] in members) if known else -1
+
+
 def _in_time_of(ground: TermInputs, grid: GridData, kept: Measurements,
                 held: Measurements) -> TermInputs:
     """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
-    for index, view in zip(grid.index, ground.visits, strict=True):
-        fitted, own = kept.views[index].visits, held.views[index].visits
-        if view is None or fitted is None or own is None or not len(fitted.mark):
+    placings = ground.placings or range(len(ground.names))
+    ranges = time_ranges([kept.views[index] for index in grid.index], placings)
+    for index, placing, view in zip(grid.index, placings, ground.visits, strict=True):
+        own = held.views[index].visits
+        if view is None or own is None or placing not in ranges:
             visits.append(view)
             continue
-        first, last = int(fitted.stamp_ns.min()), int(fitted.stamp_ns.max())
+        first, last = ranges[placing]
         time = 2 * (own.stamp_ns - first) / max(last - first, 1) - 1
         visits.append(replace(view, time=time))
     return replace(ground, visits=tuple(visits))

@@ -276,17 +276,17 @@ def _require_visits(ground: TermInputs, name: TermName) -> None:
 
 def _drift_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm, degree: int) -> None:
     orders = np.arange(1, degree + 1)
-    for view, visits in enumerate(ground.visits):
-        if visits is None:
-            continue
-        values = eval_legendre(orders[:, None], visits.time) * visits.phase
-        for order, mean, one in zip(orders, visits.means(values, ground.z.size), values,
-                                    strict=True):
-            at: list[np.ndarray | None] = [None] * len(ground.names)
-            at[view] = one
-            number = made.add({view: mean}, at)
+    for first, members in ground.members.items():
+        values, means = {}, {}
+        for view in members:
+            if (visits := ground.visits[view]) is not None:
+                values[view] = eval_legendre(orders[:, None], visits.time) * visits.phase
+                means[view] = visits.means(values[view], ground.z.size)
+        for row, order in enumerate(orders if values else ()):
+            at = [values[v][row] if v in values else None for v in range(len(ground.names))]
+            number = made.add({view: mean[row] for view, mean in means.items()}, at)
             for axis, unit in AXES:
-                made.column(Column(term.name, view, f"{axis} P{order}", term.size), number, unit)
+                made.column(Column(term.name, first, f"{axis} P{order}", term.size), number, unit)
 
 
 def _shared_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
@@ -320,17 +320,18 @@ def _values(ground: TermInputs, name: TermName, visits: ViewVisits) -> np.ndarra
 def _plate_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
     """Add the columns of plate scale or shape: the same at all visits of a mark.
 
-    A size says how far views scatter about what they have in common, so that each view has its
-    own; free ones are relative to the first view, as what all have in common is the plate's.
+    A size says how far placings scatter about what they have in common, so that each has its own;
+    free ones are relative to the first placing, as what all have in common is the plate's.
     """
     parts = _PLATE[term.name]
     forms = _plate_forms(ground, term.name)
     nothing: list[np.ndarray | None] = [None] * len(ground.names)
-    for view in range(1 if term.free else 0, len(ground.names)):
-        here = ground.weight[view].reshape(-1) > 0
-        numbers = [made.add({view: form}, nothing) for form in forms * here]
+    for first, members in list(ground.members.items())[1 if term.free else 0:]:
+        here = {view: ground.weight[view].reshape(-1) > 0 for view in members}
+        numbers = [made.add({view: form * read for view, read in here.items()}, nothing)
+                   for form in forms]
         for component, form, unit in parts:
-            made.column(Column(term.name, view, component, term.size), numbers[form], unit)
+            made.column(Column(term.name, first, component, term.size), numbers[form], unit)
 
 
 _PLATE: dict[str, tuple[tuple[str, int, complex], ...]] = {

@@ -10,7 +10,8 @@ from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import ViewVisits, approach_sign, visits_of
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import OF_LINES
+from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
+from selfcal_ros.model.view import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,11 @@ class TermInputs:
     with_lines : tuple of int
         Which of these views are views of marks as well, if there are two or more: their marks and
         lines share rotations.
+    placings : tuple of int
+        First view of the placing of the plate to which each view belongs: the cells of an image
+        see one plate, bent and drifting alike. Empty: each view is a placing.
+    placing_names : tuple of str
+        Names of the placings of the views.
     """
 
     z: np.ndarray
@@ -49,11 +55,34 @@ class TermInputs:
     line_names: tuple[str, ...] = ()
     n_lines: int = 0
     with_lines: tuple[int, ...] = ()
+    placings: tuple[int, ...] = ()
+    placing_names: tuple[str, ...] = ()
+
+    @property
+    def members(self) -> dict[int, list[int]]:
+        """Views of each placing of the plate, by the first of them."""
+        out: dict[int, list[int]] = {}
+        for view, first in enumerate(self.placings or range(len(self.names))):
+            out.setdefault(first, []).append(view)
+        return out
+
+    def names_of(self, term: str) -> tuple[str, ...]:
+        """Return the names of the views of the columns of a term."""
+        if term in OF_LINES:
+            return self.line_names
+        of_placing = term in OF_PLATE or term == TermName.DRIFT
+        return self.placing_names if of_placing and self.placing_names else self.names
 
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
-        names = self.line_names if term in OF_LINES else self.names
-        return (*names, "")[view]
+        return (*self.names_of(term), "")[view]
+
+
+def placings_of(views: Sequence[View]) -> tuple[int, ...]:
+    """Return the first of the views that belong to the same placing of the plate, for each view."""
+    first: dict[str, int] = {}
+    return tuple(row if view.cell is None else first.setdefault(view.plan_view, row)
+                 for row, view in enumerate(views))
 
 
 def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> TermInputs:
@@ -61,10 +90,13 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = maps_of(grid.y.shape[1:], grid.poses).z
-    names = tuple(measurements.views[i].view.name for i in grid.index)
-    return TermInputs(z, half_width_m, grid.weight, visits_of(measurements, grid), names,
-                  approach_sign(measurements.sense), tuple(view.view.name for view in lines),
-                  measurements.artifact.angular_count, shared if len(shared) > 1 else ())
+    views = [measurements.views[i].view for i in grid.index]
+    placings = placings_of(views)
+    return TermInputs(z, half_width_m, grid.weight, visits_of(measurements, grid, placings),
+                      tuple(view.name for view in views), approach_sign(measurements.sense),
+                      tuple(view.view.name for view in lines), measurements.artifact.angular_count,
+                      shared if len(shared) > 1 else (), placings,
+                      tuple(view.plan_view for view in views))
 
 
 def without_noise(ground: TermInputs, residuals: np.ndarray,

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.columns import (
     term_columns,
 )
 from selfcal_ros.estimation.terms.equations import TermEquations
-from selfcal_ros.estimation.terms.ground import TermInputs
+from selfcal_ros.estimation.terms.ground import TermInputs, placings_of
 from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
     project,
@@ -99,9 +99,9 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     errors = x + 1j * y
     views = with_sub_views(views)
     grid_views = [views[i] for i in system.grid_index]
-    placing = np.cumsum([view.cell is None or view.cell == view.image_cells[0]
-                         for view in grid_views]) - 1  # the cells of an image see one plate
-    placed = np.array([ndtri((first + step * placing) % 1) for first, step in SPREAD]).T
+    placings = placings_of(grid_views)
+    number = np.unique(placings, return_inverse=True)[1]  # the cells of an image see one plate
+    placed = np.array([ndtri((first + step * number) % 1) for first, step in SPREAD]).T
     visits = tuple(_visits(artifact, view, assumed, rng, (row, errors))
                    for row, view in zip(placed, grid_views, strict=True))
     lines = [views[i] for i in system.angular_index]
@@ -109,7 +109,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.half),
                   system.grid.weight, visits, tuple(view.name for view in grid_views),
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
-                  with_lines=shared if len(shared) > 1 else ())
+                  with_lines=shared if len(shared) > 1 else (), placings=placings,
+                  placing_names=tuple(view.plan_view for view in grid_views))
 
 
 def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,

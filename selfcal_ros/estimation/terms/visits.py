@@ -5,7 +5,7 @@ For the map, the mean over the visits of a mark is as good as the visits themsel
 the visits of one mark about their mean determines terms that differ between them, and the noise.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -93,15 +93,34 @@ def approach_sign(sense: Sense) -> int:
     return -1 if sense is Sense.PLATE_MOVES else 1
 
 
-def visits_of(measurements: Measurements, grid: GridData) -> tuple[ViewVisits | None, ...]:
-    """Return the visits of every grid view, in the order of `grid`; None if unknown."""
-    return tuple(_visits_of(measurements.views[i], grid, row)
-                 for row, i in enumerate(grid.index))
+def visits_of(measurements: Measurements, grid: GridData,
+              placings: Sequence[int]) -> tuple[ViewVisits | None, ...]:
+    """Return the visits of every grid view, in the order of `grid`; None if unknown.
+
+    The time is that of the placing to which a view belongs, see `TermInputs`.
+    """
+    views = [measurements.views[i] for i in grid.index]
+    ranges = time_ranges(views, placings)
+    return tuple(_visits_of(view, grid, row, ranges.get(placings[row]))
+                 for row, view in enumerate(views))
 
 
-def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | None:
+def time_ranges(views: Iterable[ViewReadings],
+                placings: Iterable[int]) -> dict[int, tuple[int, int]]:
+    """Return the first and the last instant of each placing, ns, that has visits."""
+    out: dict[int, tuple[int, int]] = {}
+    for view, placing in zip(views, placings, strict=True):
+        if view.visits is not None and len(view.visits.stamp_ns):
+            ends = int(view.visits.stamp_ns.min()), int(view.visits.stamp_ns.max())
+            first, last = out.get(placing, ends)
+            out[placing] = min(first, ends[0]), max(last, ends[1])
+    return out
+
+
+def _visits_of(view: ViewReadings, grid: GridData, row: int,
+               ends: tuple[int, int] | None) -> ViewVisits | None:
     visits = view.visits
-    if visits is None or not len(visits.mark):
+    if visits is None or not len(visits.mark) or ends is None:
         return None
     hx, hy = (size // 2 for size in grid.y.shape[1:])
     flat = (view.m + hx) * grid.y.shape[2] + (view.n + hy)
@@ -111,7 +130,7 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int) -> ViewVisits | Non
     weight = own / total[mark] * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
     return ViewVisits(mark, weight, (visits.dx + 1j * visits.dy) * phase,
-                      view_time(visits.stamp_ns), visits.offset_x + 1j * visits.offset_y,
+                      view_time(visits.stamp_ns, *ends), visits.offset_x + 1j * visits.offset_y,
                       visits.approach_x.astype(float), visits.approach_y.astype(float), phase)
 
 
@@ -150,9 +169,8 @@ def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarr
     return np.where(whole, 1 / np.where(good, visits.u, 1.0) ** 2, count)
 
 
-def view_time(stamps_ns: np.ndarray) -> np.ndarray:
-    """Return instants in the view's time: -1 at the first, +1 at the last; 0 if only one."""
-    first, last = int(stamps_ns.min()), int(stamps_ns.max())
+def view_time(stamps_ns: np.ndarray, first: int, last: int) -> np.ndarray:
+    """Return instants in the time of a view: -1 at its first, +1 at its last; 0 if only one."""
     if first == last:
         return np.zeros(len(stamps_ns))
     return 2 * (stamps_ns - first) / (last - first) - 1

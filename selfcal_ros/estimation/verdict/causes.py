@@ -22,7 +22,7 @@ from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import OF_LINES, UNITS, TermName
+from selfcal_ros.model.terms import UNITS, TermName
 from selfcal_ros.model.verdict import Cause, TermEstimate
 
 TIMES = np.linspace(-1, 1, 101)
@@ -51,7 +51,7 @@ def cause_of(found: Explanation, ground: TermInputs) -> Cause:
     ground : TermInputs
         Of the fit: names of the views, unit of a slip's rotation.
     """
-    names = ground.line_names if found.name in OF_LINES else ground.names
+    names = ground.names_of(found.name)
     value, u, fields = _SIZES[found.name](found, names, ground.half_width_m)
     unit = UNITS.get(found.name, "m")
     largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
