@@ -18,6 +18,7 @@ from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.files import write_json
 from selfcal_ros.model import result as results
 from selfcal_ros.model.json_form import finding_to_dict, plain
@@ -111,11 +112,14 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
     Terms of the model shared by all views are included by their components, in SI units.
     """
     emap, noise = result.error_map, result.noise
+    u_o, u_r = first_order_u(result) if result.has_uncertainty else (math.nan, math.nan)
     used = sum(view.used for view in result.views)
     rejected = sum(result.rejected.values())
     found = {
         "nonorthogonality_arcsec": emap.nonorthogonality * ARCSEC_PER_RAD,
+        "u_nonorthogonality_arcsec": u_o * ARCSEC_PER_RAD,
         "scale_difference_ppm": emap.scale_difference * PPM_PER_ONE,
+        "u_scale_difference_ppm": u_r * PPM_PER_ONE,
         **summary_numbers(result),
         "sigma_xy_um": noise.sigma_xy * UM_PER_M,
         "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,

@@ -3,7 +3,7 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from html import escape
@@ -87,8 +87,13 @@ def _series(plan_id: str, records: list[Record]) -> PlanHistory:
     days = (times - times[0]) / S_PER_DAY
     names = dict.fromkeys(name for record in records for name in record["quantities"])
     table = {name: np.array([record["quantities"].get(name) for record in records], dtype=float)
-             for name in names}
+             for name in names if not _is_u(name, names)}
     return PlanHistory(plan_id, tuple(records), days, courses(days, table))
+
+
+def _is_u(name: str, names: Container[str]) -> bool:
+    """Return whether a quantity is the standard uncertainty of another one."""
+    return name.startswith("u_") and name.removeprefix("u_") in names
 
 
 def _time_s(record: Record) -> float | None:
@@ -209,10 +214,14 @@ def _figure(series: PlanHistory, name: str, course: Course) -> str:
     """Return a plot of values over time with the finding: a line, or a step at the change."""
     text, unit = described(name)
     caption = f"{text}{', ' * bool(unit)}{unit}"
+    if any(f"u_{name}" in record["quantities"] for record in series.records):
+        caption += ", bars ± 2 u"
     days = series.days
     values = np.array([record["quantities"].get(name) for record in series.records], dtype=float)
     known = np.isfinite(values)
-    low, high = float(values[known].min()), float(values[known].max())
+    u = np.nan_to_num(np.array([record["quantities"].get(f"u_{name}") for record in
+                                series.records], dtype=float))
+    low, high = float((values - 2 * u)[known].min()), float((values + 2 * u)[known].max())
     margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
     drawing = Drawing(name, caption, 560, 150)
     frame = Frame(drawing, (64, 14, 482, 108), (0.0, float(days[-1]) or 1.0),
@@ -223,8 +232,11 @@ def _figure(series: PlanHistory, name: str, course: Course) -> str:
                       colour="soft")
     for number, (x, anchor) in enumerate(((64.0, "start"), (546.0, "end"))):
         drawing.label(x, 142, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft")
-    for day, value, record in zip(days, values, series.records, strict=True):
+    for day, value, spread, record in zip(days, values, u, series.records, strict=True):
         if np.isfinite(value):
+            if spread > 0:
+                drawing.line([frame.at(day, value + end) for end in (-2 * spread, 2 * spread)],
+                             stroke="soft")
             drawing.discs([frame.at(day, value)], 3.0,
                           fill="bad" if record["exit_code"] else "good")
             drawing.spot(*frame.at(day, value), 6, f"{record['bag']}: {value:.6g} {unit}")

@@ -343,3 +343,16 @@ def test_names_of_quantities_in_words():
     assert described("max_error_um") == ("max error", "µm")
     assert described("rejected_percent") == ("rejected", "%")
     assert described("microscope_scale_m_per_m") == ("microscope scale", "m/m")
+
+
+def test_quantities_with_an_uncertainty_have_bars_and_no_course_of_it():
+    found = records()
+    plain = page_html(found, series_of(found), [""])
+    for record in found:
+        record["quantities"] = record["quantities"] | {"u_nonorthogonality_arcsec": 0.01}
+    series = series_of(found)
+    assert "nonorthogonality_arcsec" in series[0].courses
+    assert "u_nonorthogonality_arcsec" not in series[0].courses
+    text = page_html(found, series, [""])
+    assert "bars ± 2 u" in text and "bars" not in plain
+    assert text.count('class="s-soft" d=') == plain.count('class="s-soft" d=') + 30

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
@@ -186,21 +188,34 @@ def error_section(result: CalibrationResult) -> Section:
              ("rms error", f"{um(figures.rms_error_m)} per axis")]
     if figures.n_known < figures.n_sites:
         facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
+    u_o, u_r = _first_order_u(result)
     facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
                              (result.noise.k_xy, result.noise.dof_of("xy"))),
               *(("not in U", printable(excluded_text(line))) for line in result.excluded),
-              ("non-orthogonality", _slope_text(emap, emap.nonorthogonality, "O", "µrad",
+              ("non-orthogonality", _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad",
                                                 "axes out of square by 2|O|")),
-              ("scale difference", _slope_text(emap, emap.scale_difference, "R", "µm/m",
+              ("scale difference", _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m",
                                                "scales of X and Y differ by 2|R|"))]
     if emap.artifact.angular_count:
         facts += _theta_facts(result)
     return Section("Stage error (indicated − true)", tuple(facts))
 
 
-def _slope_text(emap: ErrorMap, value: float, symbol: str, unit: str, meaning: str) -> str:
+def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
+    """Return the standard uncertainties of O and R; NaN if unknown."""
+    try:
+        return first_order_u(result) if result.has_uncertainty else (math.nan, math.nan)
+    except InputError:  # damaged factors: the map can be shown all the same
+        return math.nan, math.nan
+
+
+def _slope_text(emap: ErrorMap, found: tuple[float, float], symbol: str, unit: str,
+                meaning: str) -> str:
+    """Return a slope, with its standard uncertainty, and what it means."""
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
-    return (f"{symbol} {significant(value * UM_PER_M)} {unit} = {um(value * length)} over "
+    value, u = found
+    spread = f" ± {u * UM_PER_M:.3g} (k=1)" if math.isfinite(u) else ""
+    return (f"{symbol} {significant(value * UM_PER_M)}{spread} {unit} = {um(value * length)} over "
             f"{length * MM_PER_M:.6g} mm; {meaning} = {significant(2 * abs(value) * UM_PER_M)} "
             f"{unit}")
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
@@ -136,8 +137,13 @@ def test_orthogonality_and_scale_keep_their_signs_and_lengths():
     result, _ = known_result(11, 0)
     emap = replace(result.error_map, nonorthogonality=2e-6, scale_difference=-3e-6)
     text = summary_text(replace(result, error_map=emap))
-    assert "O 2.00 µrad = 0.200 µm over 100 mm; axes out of square by 2|O| = 4.00 µrad" in text
-    assert "R -3.00 µm/m = -0.300 µm over 100 mm; scales of X and Y differ by 2|R| = 6.00" in text
+    u_o, u_r = (f"{1e6 * u:.3g}" for u in first_order_u(result))
+    assert (f"O 2.00 ± {u_o} (k=1) µrad = 0.200 µm over 100 mm; axes out of square by "
+            "2|O| = 4.00 µrad") in text
+    assert (f"R -3.00 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; scales of X and Y differ by "
+            "2|R| = 6.00") in text
+    damaged = replace(result, extra={"covariance_terms": {"terms": ["x"], "factors": "no"}})
+    assert "µrad" in summary_text(damaged)
 
 
 def test_ascii_summary_is_ascii_and_still_aligned():
