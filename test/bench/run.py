@@ -6,7 +6,7 @@ memory; what goes beyond is skipped and says so. Writes build/bench.json.
 
     python test/bench/run.py [--sizes 11,21] [--methods selfcal,"scipy lsmr"]
                              [--ingest MESSAGES] [--detections NUMBER] [--compensate SECONDS]
-                             [-o FILE]
+                             [--images NUMBER] [-o FILE]
 """
 
 import argparse
@@ -23,6 +23,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 import compensate  # noqa: E402
+import detecting  # noqa: E402
 import ingest  # noqa: E402
 import with_terms  # noqa: E402
 from rivals import RIVALS, Rival, installed  # noqa: E402
@@ -210,6 +211,8 @@ def main() -> int:
                         help="detections of the other bag that is read; 0 = leave it out")
     parser.add_argument("--compensate", type=float, default=5.0, metavar="SECONDS",
                         help="time for which each compensator gets samples; 0 = leave it out")
+    parser.add_argument("--images", type=int, default=12, help="images in which marks are "
+                        "detected; 0 = leave it out")
     parser.add_argument("--ingest-worker", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -245,6 +248,9 @@ def main() -> int:
     for row in measure_compensation(args.compensate) if args.compensate else ():
         rows.append(row)
         (show if row["seconds"] is None else compensate.show)(row)
+    for row in detecting.rows(args.images) if args.images else ():
+        rows.append(row)
+        (show if row["seconds"] is None else detecting.show)(row)
     Path(args.output).parent.mkdir(parents=True, exist_ok=True)
     write_json(args.output, rows)
     print(f"written to {args.output}")

@@ -36,7 +36,8 @@ def bench(tmp_path, monkeypatch, capsys):
 
     def measured(*args):
         target = tmp_path / "bench.json"
-        monkeypatch.setattr(sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0", *args])
+        monkeypatch.setattr(sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0",
+                                          "--images", "0", *args])
         assert run.main() == 0
         return capsys.readouterr().out, json.loads(target.read_text())
 
@@ -100,3 +101,19 @@ def test_without_ros_compensators_are_left_out_with_a_reason(bench, monkeypatch)
     assert [(row["benchmark"], row["n"], row["note"]) for row in rows[::2]] == [
         (f"compensate {rate} Hz", 2 * rate, "not installed") for rate in (500, 1000, 2000, 10000)]
     assert all(row.keys() >= KEYS for row in rows)
+
+
+def test_marks_are_found_at_the_bound(bench, monkeypatch):
+    """Two images: 36 errors a row, so their rms is within 4 sigma of the bound, or 47 % of it."""
+    detecting = importlib.import_module("detecting")
+    monkeypatch.setattr(detecting, "RATIOS", (50,))
+    out, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--images", "2")
+    assert [row["benchmark"] for row in rows if row["method"] == "selfcal"] == [
+        f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")]
+    for row in rows:
+        if row["method"] == "selfcal":
+            assert row["found"] == 1.0 and 0.53 < row["rms_px"] / row["bound_px"] < 1.47
+            assert row["max_error"] < 0.05 * 2e-6
+        else:
+            assert row["seconds"] is not None or row["note"] == "not installed"
+        assert row.keys() >= KEYS and row["benchmark"] in out
