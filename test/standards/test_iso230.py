@@ -21,6 +21,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from selfcal_ros.standards.iso230 import (
+    Scatter,
     axis_figures,
     bidirectional,
     circle_figures,
@@ -49,6 +50,31 @@ def test_the_figures_are_those_of_the_definitions():
         assert found[name] == pytest.approx(value), name
     alone = bidirectional(up, up, s_up, 0.5 * s_up)  # four s beat two and two without reversal
     assert alone["R"] == pytest.approx(1.2)
+
+
+def test_the_figures_of_many_draws_are_those_of_each():
+    rng = np.random.default_rng(1)
+    draws = rng.normal(size=(4, 5, 3)) ** [[[2]], [[2]], [[2]], [[2]]]
+    found = bidirectional(*draws)
+    for index in range(5):
+        for name, value in bidirectional(*draws[:, index]).items():
+            assert found[name][index] == pytest.approx(value), name
+
+
+def test_the_uncertainty_of_the_mean_reversal_is_that_of_its_approaches():
+    """Seven sites, s of 30 and 40 nm: a reversal of four approaches each has u = s (2 / 4)^1/2."""
+    items = {(i, 0): Scatter(1e-7, np.sqrt(0.5), 30e-9, 40e-9, 3, 3, 0.0) for i in range(-3, 4)}
+    stage = StageMap(result_of(random_map(ARTIFACT, 1)))
+    found = axis_figures(stage, 0, 0, items).figures["mean B"]
+    assert found.value == pytest.approx(-1e-7)
+    assert found.u == pytest.approx(np.sqrt((30e-9**2 + 40e-9**2) / 2 * 0.5 / 7), rel=0.06)
+
+
+def test_sites_that_are_not_known_are_no_positions():
+    stage = StageMap(result_of(random_map(ARTIFACT, 1, unknown=((1, 3), (0, 0)))))
+    found = axis_figures(stage, 0, 0)
+    np.testing.assert_allclose(found.position_m, np.array([-3, -1, 0, 1, 2, 3]) * 0.01)
+    assert len(axis_figures(stage, 1, 0).position_m) == 7
 
 
 def measured(*, sense=Sense.MICROSCOPE_MOVES, sigma=0.0, seed=1, repeats=4, order="x_back_y_back"):

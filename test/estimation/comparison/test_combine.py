@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
@@ -96,6 +96,23 @@ def test_scatter_in_a_shape_enters_u_with_the_pattern_of_that_shape():
     assert found.p_between < 1e-6 and found.dof == pytest.approx(2.0, rel=0.02)
     np.testing.assert_allclose(np.diag(found.covariance), found.u**2)
     assert found.covariance[0, 3] < 0 < found.covariance[0, 1]
+
+
+def test_the_probability_of_the_scatter_is_that_of_chi_squared_and_of_two_shapes():
+    """Amplitudes -1, 0, 1 of a unit shape with variance 0.5: chi^2 is 4 with 2 dof; rest: none."""
+    shape = np.full((4, 1), 0.5)
+    runs = [run_of(amplitude * shape[:, 0], 0.5) for amplitude in (-1.0, 0.0, 1.0)]
+    found = mean_of(runs, np.zeros((4, 0)), shape)
+    assert found.p_between == pytest.approx(2 * chi2.sf(4.0, 2), rel=1e-6)
+
+
+def test_what_is_shared_is_known_and_adds_degrees_of_freedom():
+    shape = np.array([[3.0], [1.0], [-1.0], [-3.0]])
+    alone, shared = (mean_of([run_of(amplitude * shape[:, 0], 0.01, common=common)
+                              for amplitude in (-1.0, 0.0, 1.0)], np.zeros((4, 0)), shape)
+                     for common in (0.0, 7.0))
+    ratio = np.median(shared.u**4 / (alone.within + alone.between)**2 * alone.dof)
+    assert shared.dof == pytest.approx(ratio, rel=0.02) and shared.dof > 10 * alone.dof
 
 
 def test_the_datum_of_a_run_changes_nothing():
