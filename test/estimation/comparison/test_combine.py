@@ -190,6 +190,37 @@ def test_a_reference_length_is_kept_once():
         combine([*runs, part("c", C)], keep_scale=True)
 
 
+def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
+    """x y in Gx and two waves per turn, amplitudes -1, 0, 1 of 1 µm and 1 mrad."""
+    x, y = ARTIFACT.x_m / 0.03, ARTIFACT.y_m / 0.03
+    field = remove_modes(np.stack([x * y, np.zeros_like(x)]), datum_modes(ARTIFACT, scale=True))
+    wave = np.cos(2 * np.arange(ARTIFACT.angular_count) * 2 * np.pi / ARTIFACT.angular_count)
+    runs = []
+    for amplitude in (-1.0, 0.0, 1.0):
+        emap = A.error_map
+        runs.append(part(str(amplitude), replace(A, input={}, error_map=replace(
+            emap, gx=emap.gx + 1e-6 * amplitude * field[0],
+            gy=emap.gy + 1e-6 * amplitude * field[1],
+            g_theta=emap.g_theta + 1e-3 * amplitude * wave))))
+    found = combine(runs)
+    assert np.corrcoef(found.theta.between, wave**2)[0, 1] > 0.999
+    assert found.theta.between.max() == pytest.approx(1e-6 / 3, rel=0.01)
+    whole = field.reshape(2, -1).ravel() ** 2
+    assert np.corrcoef(found.xy.between, whole)[0, 1] > 0.999
+    assert found.xy.between.max() == pytest.approx(whole.max() * 1e-12 / 3, rel=0.01)
+
+
+def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
+    """Twice the u of the calibration: a fifth of the weight of both."""
+    emap = A.error_map
+    other = replace(emap, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy, u_g_theta=2 * emap.u_g_theta)
+    found = combine([part("a", A), Part("b", other)])
+    np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
+    np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
+    assert "xy" not in found.result.extra.get("map_covariance", {})
+    assert not xy_covariance(found.result, found.known)[1]
+
+
 @pytest.mark.parametrize(("kind", "size"), [
     ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9), ("smooth", 100e-9)])
 def test_coverage_and_false_alarms(kind, size):
