@@ -280,7 +280,8 @@ RUNS = {
     "cal orthogonality": "cal orthogonality --measured 5um --over 200mm --travel 300mm",
     "step-diagonal": "step-diagonal DATA --method new -o d.json"}
 NEEDS_NODES = {"replay", "up", "monitor", "call", "cell check"}
-ELSEWHERE = {"detect": "test_detect.py", "recheck": "test_recheck.py"}
+ELSEWHERE = {"detect": "test_detect.py", "recheck": "test_recheck.py",
+             "camera init": "test_camera.py"}
 """Verbs whose bags are made by other tests."""
 
 
