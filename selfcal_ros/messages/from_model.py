@@ -173,7 +173,7 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "sigma_theta": result.noise.sigma_theta,
         "identifiable": result.observability.identifiable,
         "qualified": result.verdict.qualified, "run_id": result.run_id,
-        "grade": grade_number(result)}
+        "grade": grade_number(result), "interpolation": result.interpolation}
 
 
 def grade_number(result: CalibrationResult) -> int:

@@ -183,6 +183,12 @@ class CalibrationResult:
         return self.placed_plate or self.error_map.artifact
 
     @property
+    def interpolation(self) -> str:
+        """Interpolation between the nodes of the map; empty if they are the plate's sites."""
+        grid = self.plate.map_grid
+        return "" if grid is None else str(grid.interpolation)
+
+    @property
     def has_uncertainty(self) -> bool:
         """Whether the uncertainty of the XY map was computed."""
         emap = self.error_map

@@ -5,12 +5,12 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
-from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.compensator import Compensator, Interpolation
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import to_model
@@ -64,7 +64,8 @@ class CompensatingSession:
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(path, "the map is not qualified", "measure again, or set "
                              "require_qualified to false")
-        self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0)
+        self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0,
+                  result.interpolation)
 
     def take_map(self, message: Any) -> None:
         """Take a selfcal_msgs/ErrorMap: use it, now or once its summary confirms it."""
@@ -86,7 +87,7 @@ class CompensatingSession:
         if not waits:
             message, self._map = self._map, None
             self._use(to_model.error_map(message), _source(message),
-                      to_model.stamp_ns(message))
+                      to_model.stamp_ns(message), str(getattr(message, "interpolation", "")))
 
     def _doubt(self) -> str:
         """Return why the newest map must not be used, or ""."""
@@ -103,8 +104,15 @@ class CompensatingSession:
                     "views")
         return ""
 
-    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int) -> None:
-        self.compensator = Compensator(error_map, method=self._settings.interpolation,
+    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, stated: str) -> None:
+        """Use a map with the interpolation stated with it, or that of the parameter.
+
+        With unknown nodes there is no spline: such a map is interpolated bilinearly.
+        """
+        method = self._settings.interpolation
+        if stated in get_args(Interpolation):
+            method = cast(Interpolation, stated) if error_map.valid.all() else "bilinear"
+        self.compensator = Compensator(error_map, method=method,
                                        outside=self._settings.outside)
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")

@@ -340,6 +340,9 @@ def test_an_error_map_comes_back(result):
     emap = result.error_map
     message = through_cdr("ErrorMap", from_model.error_map(result, STAMP_NS, "f"))
     found = to_model.error_map(message)
+    assert message.interpolation == ""
+    own = replace(result, placed_plate=replace(emap.artifact, map_grid=MapGrid(3, 0.01)))
+    assert from_model.error_map(own, STAMP_NS, "f")["interpolation"] == "bicubic"
     for name in ("gx", "gy", "g_theta", "u_g_theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(emap, name), name)
     for name in ("u_gx", "u_gy"):

@@ -131,6 +131,20 @@ def test_a_request_that_cannot_be_met_is_refused_as_a_whole(desk, x, y, theta, m
         desk.session.answer(x, y, theta, inverse=False)
 
 
+@pytest.mark.parametrize(("parameter", "stated", "whole", "used"), [
+    ("bilinear", "", True, "bilinear"), ("bicubic", "", True, "bicubic"),
+    ("bilinear", "bicubic", True, "bicubic"), ("bicubic", "bilinear", True, "bilinear"),
+    ("bicubic", "bicubic", False, "bilinear"),
+    ("bicubic", "of tomorrow", True, "bicubic")])
+def test_a_map_is_interpolated_as_it_was_estimated(parameter, stated, whole, used):
+    desk = Desk(interpolation=parameter)
+    known = ONE if whole else random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),))
+    desk.session.take_map(map_of(known, interpolation=stated))
+    desk.session.take_summary(summary_of())
+    wanted = Compensator(known, method=used).correct_point(0.0033, 0.0021)
+    assert tuple(desk.session.correct(NAMES, [0.0033, 0.0021, 0.0])[:2]) == wanted
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
     for take in [lambda: desk.session.take_map(map_of()),

@@ -207,7 +207,8 @@ class CompensatorSettings(ManagedSettings):
     joint_y: str = declared("y", "name of the joint that indicates y")
     joint_theta: str = declared("theta", "name of the joint that indicates theta")
     interpolation: Interpolation = declared(
-        "bilinear", "interpolation between nodes", choices=get_args(Interpolation))
+        "bilinear", "interpolation between nodes, unless the map states its own",
+        choices=get_args(Interpolation))
     outside: Outside = declared(
         "clamp", "treatment of positions outside the field", choices=get_args(Outside))
     map: str = declared("", "RESULT.json to start with; empty = wait for selfcal/error_map")
