@@ -185,3 +185,10 @@ def test_readings_are_turned_back_into_the_stage_frame(turn):
     at = views[2].m[40] + 5, views[2].n[40] + 5
     assert before.turn_rad == pytest.approx(turn, abs=0.01)
     assert change[at] == pytest.approx(1e-6, abs=0.1e-6)
+
+
+@pytest.mark.parametrize(("nodes", "said"), [(17, False), (19, True)])
+def test_a_map_of_too_many_nodes_says_that_their_number_was_not_tested(nodes, said):
+    measurements, _ = readings(plate(23, nodes), THREE, np.random.default_rng(1))
+    found = calibrate(measurements, Options(assumed=())).findings
+    assert ("roughness_untested" in [finding.name for finding in found]) is said

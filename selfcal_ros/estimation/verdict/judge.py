@@ -26,6 +26,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import free_inverse
 from selfcal_ros.estimation.verdict.excluded import excluded_lines
 from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
+from selfcal_ros.estimation.verdict.roughness import is_untested
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, is_searched, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
@@ -92,7 +93,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
                           effect for effect in searched.effects if effect.name != LACK_OF_FIT
                           or LACK_OF_FIT in [cause.name for cause in searched.causes]]))
     result = replace(
-        result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked)),
+        result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked),
+                                                 *_untested(solved)),
         provenance=provenance_of(measurements, options))
     return replace(result, budget=tuple(budget_lines(result)),
                    excluded=_excluded(solved, result, options))
@@ -191,6 +193,12 @@ def _axes_findings(solved: Solved) -> list[Finding]:
     p, size_rad = solved.axes
     return [] if p >= MISCLOSURE_LEVEL else [
         Finding("axes_not_met", size_rad, unit="rad", p=p)]
+
+
+def _untested(solved: Solved) -> list[Finding]:
+    """Return a finding if the map has too many nodes to test whether they suffice."""
+    untested = solved.model is not None and is_untested(solved.model)
+    return [Finding("roughness_untested")] if untested else []
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:

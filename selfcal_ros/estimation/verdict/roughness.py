@@ -7,6 +7,7 @@ better (F-test of its further coefficients, method eq. 12.4). What both differ b
 is the lack of fit, a part of the uncertainty at the nodes and between them (eq. 12.5).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,12 +85,10 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         A fit; finite rotations and terms are taken off its readings.
     """
     system = model.problem.system
-    if not isinstance(system, PlacedEquations):
+    if not isinstance(system, PlacedEquations) or is_untested(model):
         return None
     grid = system.grid
     finer = grid.views.spline.refined
-    if finer.shape[0] * finer.shape[1] > MAX_COEFFICIENTS:
-        return None
     fine = PlacedEquations(PlacedSystem(grid.views.poses, grid.weight, finer),
                            AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
     parts = [(one, _effective(one), _squares(one, model.y)) for one in (fine, system)]
@@ -104,6 +103,13 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     else:
         p = float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
     return Adequacy(p, _lack(fine, system, model.y, sigma_m), more, grid.views.shape)
+
+
+def is_untested(model: ModelFit) -> bool:
+    """Return whether a map has too many nodes for the test of their number."""
+    system = model.problem.system
+    return isinstance(system, PlacedEquations) and (
+        math.prod(system.grid.views.spline.refined.shape) > MAX_COEFFICIENTS)
 
 
 def known_places(system: PlacedEquations) -> np.ndarray:
