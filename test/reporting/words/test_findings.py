@@ -32,7 +32,7 @@ from test.support.sources import PACKAGE
 
 ARCSEC_RAD = math.pi / 648_000
 NAMES = ("0", "90", "+x")
-GROUND = SimpleNamespace(names=NAMES, line_names=NAMES, half_width_m=0.05)
+GROUND = SimpleNamespace(names_of=lambda term: NAMES, names=NAMES, half_width_m=0.05)
 MICROSCOPE = ("scale", "turn", "stretch", "shear")
 ALIGN = "align the microscope, or have the stage stop next to the marks deliberately (check_stops)"
 CLAMP = "support the plate without strain"
@@ -276,7 +276,7 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     """Whatever a view is called: what a cause is, and what to do, come from the data."""
     found = explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7)
     cause = replace(cause_of(found, SimpleNamespace(
-        names=("0: first", "90", ODD), half_width_m=0.05)), remedies=(
+        names_of=lambda term: ("0: first", "90", ODD), half_width_m=0.05)), remedies=(
         Remedy("model", "plate_scale:3e-06"), Remedy("view", ODD)))
     what = (f"a plate larger by 2.00 ± 0.10 µm/m in view '{ODD}' than in view '0: first'")
     noisy = Finding("noisy_view", 2.26, unit="m/m", view=ODD)
