@@ -249,7 +249,8 @@ def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules
     visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
                          offset=offset, approach=marks.approach,
                          step_m=view.check_offset_m / 2 or np.inf)
-    motion = repeat_motion(key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
+    motion = None if view.cell not in (None, (0, 0)) else repeat_motion(  # the same in every cell
+        key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
     mark = means.key.astype(np.int64)
     return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,

@@ -94,6 +94,12 @@ class View:
         """The cells of the image in their order; none without images."""
         return self.image.cells if self.image is not None else []
 
+    def step_on_plate(self, artifact: Artifact) -> tuple[int, int]:
+        """Return the steps (m, n) on the plate from the mark on the optical axis to the cell's."""
+        if self.image is None or self.cell is None:
+            return 0, 0
+        return self.image.step_on_plate(self.cell, self.pose.quarters, artifact)
+
     @property
     def plan_view(self) -> str:
         """Name of the view in the plan: of a sub-view without its cell."""

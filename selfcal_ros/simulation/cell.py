@@ -5,12 +5,13 @@ The stage moves from mark to mark, dwells, and the microscope exposes in the mid
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
@@ -153,6 +154,18 @@ class GridExposures:
     approach: np.ndarray
     site: np.ndarray
     others: tuple["Seen", ...] = ()
+
+    def of_cell(self, artifact: Artifact, sub_view: View) -> "GridExposures":
+        """Return the exposures as those of the marks in a cell, offsets from its place."""
+        if sub_view.cell is None:
+            return self
+        seen = next((one for one in self.others if one.cell == sub_view.cell), None) or Seen(
+            (0, 0), self.offset, np.stack([self.visits.m, self.visits.n]), self.there)
+        m, n = seen.mark
+        site = np.stack(sub_view.on_stage(artifact).site_of(m, n)) * artifact.grid_pitch_m
+        place = np.array([[sub_view.cell_m.real], [sub_view.cell_m.imag]])
+        return replace(self, visits=replace(self.visits, m=m, n=n), offset=seen.offset - place,
+                       mark=seen.mark, there=seen.there, site=site, others=())
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
         Settings of the cell; replaces `sigma_m`, `sigma_theta_rad` and `sense`.
     """
     truth = truth if linear is None else replace(truth, linear=linear)
-    if visits or settings or truth.by_visit:
+    if visits or settings or truth.by_visit or any(view.image for view in plan.views):
         settings = settings or cell.CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
                                                  servo_sigma_theta_rad=0.0)
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
@@ -88,11 +88,13 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
 
 def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
               missing: float) -> Measurements:
-    views, start_ns = [], FIRST_STAMP_NS
+    views: list[ViewReadings] = []
+    start_ns = FIRST_STAMP_NS
     for item in enumerate(plan.views):
-        views.append(measured_view(truth, item, rng, settings=settings, missing=missing,
-                                   start_ns=start_ns))
-        start_ns += (views[-1].used + 1) * settings.period_ns + BETWEEN_VIEWS_NS
+        made = measured_view(truth, item, rng, settings=settings, missing=missing,
+                             start_ns=start_ns).parts
+        views += made
+        start_ns += (sum(part.used for part in made) + 1) * settings.period_ns + BETWEEN_VIEWS_NS
     return Measurements(plan.plan_id, plan.artifact, tuple(views), settings.sense)
 
 
@@ -157,16 +159,19 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
         Beginning of the view.
     """
     index, view = item
-    readings = ViewReadings(view)
+    parts = [ViewReadings(sub) for sub in view.sub_views]
     if view.grid:
         exposures = cell.grid_exposures(truth, index, view, settings=settings, rng=rng)
-        readings = _grid(readings, truth, exposures, settings=settings,
-                         lost=_lost(rng, missing, truth.artifact.shape), start_ns=start_ns)
+        lost = _lost(rng, missing, truth.artifact.shape)
+        parts = [_grid(part, truth, exposures.of_cell(truth.artifact, part.view),
+                       settings=settings, lost=lost, start_ns=start_ns) for part in parts]
     if view.angular and truth.artifact.angular_count:
         found = cell.angular_exposures(truth, index, view, settings=settings, rng=rng)
-        readings = _angular(readings, truth, found, sense=settings.sense,
-                            lost=_lost(rng, missing, truth.artifact.angular_count))
-    return replace(readings, used=int(readings.count.sum() + readings.count_theta.sum()))
+        lines = _lost(rng, missing, truth.artifact.angular_count)
+        parts = [_angular(part, truth, found, sense=settings.sense, lost=lines)
+                 if part.view.angular else part for part in parts]
+    parts = [replace(part, used=int(part.count.sum() + part.count_theta.sum())) for part in parts]
+    return parts[0] if len(parts) == 1 else replace(ViewReadings(view), cells=tuple(parts))
 
 
 def _lost(rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int) -> np.ndarray:

@@ -65,17 +65,8 @@ def beside(marks: np.ndarray, artifact: Artifact, sub_view: View, sign: int = 1)
     """
     out = np.zeros_like(marks)
     m, n = np.nonzero(marks)
-    step_m, step_n = step_on_plate(artifact, sub_view)
+    step_m, step_n = sub_view.step_on_plate(artifact)
     m, n = m + sign * step_m, n + sign * step_n
     there = (m >= 0) & (m < marks.shape[0]) & (n >= 0) & (n < marks.shape[1])
     out[m[there], n[there]] = True
     return out
-
-
-def step_on_plate(artifact: Artifact, sub_view: View) -> tuple[int, int]:
-    """Return the steps (m, n) on the plate from the mark on the optical axis to that of a cell."""
-    if sub_view.image is None or sub_view.cell is None:
-        return 0, 0
-    turned_back = (1, -1j, -1, 1j)[sub_view.pose.quarters % 4]
-    step = turned_back * complex(*sub_view.cell) * sub_view.image.steps(artifact)
-    return round(step.real), round(step.imag)

@@ -13,6 +13,7 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise import F_LEVEL, MIN_REPEAT_DOF, SAME
+from selfcal_ros.estimation.joint.problem import noise_excess
 
 MAX_SITES = 51 * 51
 """Largest field in which the axes are told apart: the time grows with the square of the sites."""
@@ -41,6 +42,7 @@ def axis_contrast(model: ModelFit) -> float:
         weight = problem.system.grid.weight
         squares = np.array([(weight * part**2).sum() for part in (rest.real, rest.imag)])
         dof = model.found.xy.dof_residuals / 2
+    dof /= noise_excess(problem, model.found.residuals)
     small, large = sorted(squares)
     if not (dof >= 1 and small > 0 and large > SAME**2 * small
             and 2 * float(fdtrc(dof, dof, large / small)) < F_LEVEL):

@@ -18,7 +18,13 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.moving import Moving
-from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
+from selfcal_ros.estimation.joint.problem import (
+    ROUNDING,
+    Problem,
+    grid_dof,
+    noise_excess,
+    sigma_of,
+)
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
@@ -178,7 +184,8 @@ def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, 
                    coefficients=model.coefficients)
     right = scored.total + equations.information @ model.coefficients
     noise = model.found.xy
-    return size_tests(equations, right, terms, (noise.sigma, noise.dof))
+    excess = noise_excess(model.problem, model.found.residuals)
+    return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))
 
 
 def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:

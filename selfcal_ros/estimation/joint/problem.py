@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.joint.noise import (
     MIN_REPEAT_DOF,
     NoiseEstimate,
@@ -77,6 +78,8 @@ class Problem:
         Where the stage stood; None where that is not known.
     at_places : bool
         Whether readings have the stage error of that place, or that of the site of their mark.
+    images : ImageNoise, optional
+        Images behind the readings, whose marks share noise; None without images.
     """
 
     system: NormalEquations
@@ -97,6 +100,7 @@ class Problem:
     turn_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     places: StagePlaces | None = None
     at_places: bool = True
+    images: ImageNoise | None = None
 
     @property
     def moves(self) -> bool:
@@ -154,14 +158,25 @@ def repeats_of(measurements: Measurements
 
 def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
-    if problem.residuals_xy is not None:
-        return noise_estimate(problem.repeats_xy, problem.residuals_xy, problem.grid.sigma_declared,
-                     floor=FLOOR)
     grid = problem.system.grid
-    dof = grid_dof(problem)
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    return noise_estimate(problem.repeats_xy, sigma_of(total, dof), problem.grid.sigma_declared,
-                 floor=FLOOR)
+    alone = sigma_of(total, grid_dof(problem))
+    found = alone if problem.residuals_xy is None else problem.residuals_xy
+    repeats = problem.repeats_xy
+    if problem.images is not None and total > 0:  # of which residuals show only part
+        noises = problem.images.noises(residual)
+        found = found[0] * noises.sigma / alone[0], min(noises.dof, found[1])
+        repeats = repeats[0], repeats[1] / noises.excess(problem.images.marks)
+    return noise_estimate(repeats, found, problem.grid.sigma_declared, floor=FLOOR)
+
+
+def noise_excess(problem: Problem, residual: np.ndarray) -> float:
+    """Return the largest variance of effects on all marks of an image, over that of a reading.
+
+    1 without images. `residual` as in `grid_noise`.
+    """
+    images = problem.images
+    return 1.0 if images is None else images.noises(residual).excess(images.marks)
 
 
 def grid_dof(problem: Problem) -> int:

@@ -30,9 +30,15 @@ from selfcal_ros.estimation.datum.plate import (
     plate_covariance,
     plates_of_terms,
 )
-from selfcal_ros.estimation.joint.axes import MAX_SITES, axis_contrast, axis_variances
+from selfcal_ros.estimation.joint.axes import (
+    MAX_SITES,
+    added_variances,
+    axis_contrast,
+    axis_variances,
+)
 from selfcal_ros.estimation.joint.correlated import correlated_variances, time_correlation
 from selfcal_ros.estimation.joint.fit import JointFit
+from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.moving import noise_gain
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
@@ -150,7 +156,8 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
         ground, options.reference, rigid, terms, options.drift_degree,
         places=places_of(measurements, grid, ground, system.known_sites),
-        at_places=options.at_places)
+        at_places=options.at_places,
+        images=image_noise(measurements.artifact, [v.view for v in measurements.views], system))
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
 
@@ -326,6 +333,9 @@ def _structured(model: ModelFit, cover: FieldCovariance) -> np.ndarray | float:
         added = contrast * axis_variances(model, cover)
     if len(correlation := time_correlation(model)):
         added = added + correlated_variances(model, cover, correlation)
+    images = model.problem.images
+    if images is not None and (share := images.noises(model.found.residuals).share):
+        added = added + share * added_variances(model, cover, images.added)
     return added
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
+from selfcal_ros.estimation.joint.problem import noise_excess
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.ground import TermInputs, without_noise
@@ -86,12 +87,16 @@ class Candidates:
         Information on each coefficient of the model from its size; 0 for all others.
     taken : float array (p,)
         Estimated coefficients of the model; 0 for all others.
+    excess, common : float
+        Variance of what is common to the marks of an image, over that of a reading, and in m^2.
     """
 
     equations: TermEquations
     right: Score
     prior: np.ndarray
     taken: np.ndarray
+    excess: float = 1.0
+    common: float = 0.0
 
     def explain(self, rows: np.ndarray) -> Explained:
         """Fit the columns of `rows`, bool (p,), together."""
@@ -290,8 +295,11 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
     prior = np.where(columns.rows(own), equations.prior(model.found.xy.sigma), 0.0)
-    return select_explanations(Candidates(equations, right, prior, taken), groups,
-                               columns.rows(own))
+    pool = Candidates(equations, right, prior, taken)
+    if problem.images is not None:
+        excess = noise_excess(problem, model.found.residuals)
+        pool = replace(pool, excess=excess, common=excess * model.found.xy.residuals**2)
+    return select_explanations(pool, groups, columns.rows(own))
 
 
 def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
@@ -379,7 +387,7 @@ def _test(pool: Candidates, before: Explained, after: Explained,
     variance, dof = pool.noise(after)
     if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
         return None
-    p = float(fdtrc(more, dof, gained / more / variance))
+    p = float(fdtrc(more, dof / pool.excess, gained / more / max(variance, pool.common)))
     # of all readings together, so that explanations are compared by the same squares
     whole, n = pool.everything
     rest = max(whole - after.explained, FLOOR_M**2)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that the marks of an image share, beside that of each mark (method eq. 4.14).
+
+Vibration and noise of the encoders move all marks of an image together. Such noise looks like an
+error of the stage, so that residuals show only part of it. Both noises follow from two sums of
+squares of the residuals, of the readings and of the images' sums, and from what draws of either
+noise make of them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.view import View
+
+SAMPLES = 60_000
+"""Readings of all draws together, and limits of the number of draws."""
+FEWEST, MOST = 8, 64
+
+
+@dataclass(frozen=True)
+class TwoNoises:
+    """Noises of one reading: common to the marks of an image, and of a mark, m; their sum's dof."""
+
+    image: float
+    mark: float
+    dof: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of one reading, m."""
+        return math.hypot(self.image, self.mark)
+
+    @property
+    def share(self) -> float:
+        """Correlation of the marks of an image."""
+        return self.image**2 / self.sigma**2 if self.sigma else 0.0
+
+    def excess(self, marks: float) -> float:
+        """Return the variance of what images of so many marks have in common, over a reading's."""
+        return 1 + (marks - 1) * self.share
+
+
+@dataclass(frozen=True, eq=False)
+class ImageNoise:
+    """Images behind the grid readings, and what noise leaves in their residuals.
+
+    Attributes
+    ----------
+    stop : int array (n,)
+        Index of the stop of the stage at which each reading was made, of those read: the images
+        taken there.
+    read : bool array (views, nx, ny)
+        The readings.
+    weight : float array (n,)
+        Their weights.
+    drawn : float array (draws, 2, 3)
+        Sums of squares of the residuals, and of the sums of images, for unit noise of marks, for
+        that of images, and of both together less these.
+    """
+
+    stop: np.ndarray
+    read: np.ndarray
+    weight: np.ndarray
+    drawn: np.ndarray
+
+    @property
+    def marks(self) -> float:
+        """Number of marks of an image, as a mean over its marks."""
+        count = np.bincount(self.stop)
+        return float((count**2).sum() / count.sum())
+
+    def sums(self, residual: np.ndarray) -> np.ndarray:
+        """Return the sum of squares of residuals (views, nx, ny), and that of images' sums, m^2."""
+        one = np.sqrt(self.weight) * residual[self.read]
+        together = np.bincount(self.stop, one.real) + 1j * np.bincount(self.stop, one.imag)
+        return np.array([(abs(one) ** 2).sum(), (abs(together) ** 2).sum()])
+
+    def noises(self, residual: np.ndarray) -> TwoNoises:
+        """Return the noises that residuals (views, nx, ny) show."""
+        expected, sums = self.drawn.mean(axis=0), self.sums(residual)
+        both = np.linalg.inv(expected[:, :2])
+        found = both @ sums
+        if found.min() < 0:  # one of the two alone
+            alone = int(found[1] > found[0])
+            both = np.zeros((2, 2))
+            both[alone, 0] = 1 / expected[0, alone]
+            found = both @ sums
+        mark, image = np.sqrt(found)
+        scatter = (self.drawn @ [mark**2, image**2, mark * image]) @ both.sum(axis=0)
+        spread = scatter.var(ddof=1)
+        dof = 2 * scatter.mean() ** 2 / spread if spread else math.inf
+        return TwoNoises(float(image), float(mark), float(dof))
+
+    def added(self, rest: np.ndarray) -> np.ndarray:
+        """Return what full correlation within images adds to variances, (k,), for unit noise.
+
+        Parameters
+        ----------
+        rest : complex array (k, views, nx, ny)
+            Sensitivities of k coordinates over the weights, see `added_variances`.
+        """
+        one = np.sqrt(self.weight) * rest[:, self.read]
+        n_stops = int(self.stop.max()) + 1
+        together = np.zeros((len(rest), n_stops), dtype=complex)
+        np.add.at(together.T, self.stop, one.T)
+        return (abs(together) ** 2).sum(axis=1) - (abs(one) ** 2).sum(axis=1)
+
+
+def image_noise(artifact: Artifact, views: Sequence[View],
+                system: NormalEquations) -> ImageNoise | None:
+    """Return the images behind grid readings; None without images, or for iterated fields.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The plate.
+    views : sequence of View
+        All views of the measurement; sub-views of one view have images in common.
+    system : NormalEquations
+        The grid readings.
+    """
+    grid = system.grid
+    mine = [views[index] for index in system.grid_index]
+    if not system.direct or not any(view.cell is not None for view in mine):
+        return None
+    stops = _stops(artifact, mine, grid.read)
+    weight = grid.weight[grid.read]
+    drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
+    plain = ImageNoise(stops, grid.read, weight, drawn)
+    rng = np.random.default_rng(0)
+    for row in drawn:
+        mark, image = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (
+            len(stops), stops.max() + 1))
+        left = [_residual(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
+        row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
+        row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
+    return plain
+
+
+def _stops(artifact: Artifact, views: Sequence[View], read: np.ndarray) -> np.ndarray:
+    """Return the index of the stop of each reading, int array (n,).
+
+    A stop is that of a view of the plan, at the mark from which the cell is as many steps away.
+    """
+    names = list(dict.fromkeys(view.plan_view for view in views))
+    view, m, n = np.nonzero(read)
+    steps = np.array([one.step_on_plate(artifact) for one in views])
+    keys = np.stack([np.array([names.index(v.plan_view) for v in views])[view],
+                     m - steps[view, 0], n - steps[view, 1]])
+    return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
+
+
+def _residual(system: NormalEquations, values: np.ndarray) -> np.ndarray:
+    """Return the residuals of readings `values` (n,), grid alone, (views, nx, ny)."""
+    grid = system.grid
+    y = np.zeros(grid.read.shape, dtype=complex)
+    y[grid.read] = values
+    free, d = grid.reduced(y)
+    alone = system.grid_inverse @ d
+    field = (free - grid.response @ alone).reshape(grid.views.shape)
+    return grid.plate(y, field, alone)[1]

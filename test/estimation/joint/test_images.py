@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that the marks of an image share: estimated, and in U, against dense linear algebra."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.images import image_noise
+from selfcal_ros.estimation.joint.solve import fit_joint
+from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
+from selfcal_ros.estimation.normal.systems import system_for
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
+from test.support.plans import image_plan
+
+MARK = 2e-8
+ALONE = Options(assumed=())
+
+
+def measured(image_m: float, seed: int, *, size: int = 7, repeats: int = 1, missing: float = 0.0,
+             sense: Sense = Sense.MICROSCOPE_MOVES, **spread):
+    """Return truth and readings of two turns with images of 3 x 3 marks."""
+    plan, rng = image_plan(size, repeats=repeats), np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, 2, rng, Spread(
+        **{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread))
+    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense)
+    return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
+
+
+def dense(measurements):
+    """Return the matrix of (2.2), rows x then y of every reading, and the stop of each reading.
+
+    Unknowns: G and A, x then y of each site and mark, then phi, tx, ty of each sub-view.
+    """
+    (nx, ny), (hx, hy) = measurements.artifact.shape, measurements.artifact.half
+    count = sum(len(view.m) for view in measurements.views)
+    rows, stops = np.zeros((2 * count, 4 * nx * ny + 3 * len(measurements.views))), []
+    place = 0
+    for number, view in enumerate(measurements.views):
+        turn = round(view.view.rotation_rad / (np.pi / 2))
+        cosine, sine = ((1, 0), (0, 1))[turn]
+        a, b = (round(t / measurements.artifact.grid_pitch_m) for t in view.view.translation_m)
+        for m, n in zip(view.m, view.n, strict=True):
+            x, y = cosine * m - sine * n, sine * m + cosine * n
+            site = (x + a + hx) * ny + y + b + hy
+            mark = (m + hx) * ny + n + hy
+            stops.append((view.view.rotation_rad, site))
+            at, own = 2 * place, 4 * nx * ny + 3 * number
+            rows[at, 2 * site] = rows[at + 1, 2 * site + 1] = 1
+            rows[at:at + 2, 2 * (nx * ny + mark):2 * (nx * ny + mark) + 2] = [
+                [cosine, -sine], [sine, cosine]]
+            rows[at:at + 2, own] = -y, x
+            rows[at, own + 1] = rows[at + 1, own + 2] = 1
+            place += 1
+    return rows, np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def datum(artifact) -> np.ndarray:
+    """Return the projector of a map, x and y of each site, on that without the four modes."""
+    x, y = artifact.m.ravel().astype(float), artifact.n.ravel().astype(float)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    modes = np.stack([np.stack(pair, axis=1).ravel() for pair in (
+        (one, zero), (zero, one), (-y, x), (x, y))])
+    basis = np.linalg.qr(modes.T)[0]
+    return np.eye(2 * x.size) - basis @ basis.T
+
+
+@cache
+def whole(missing: float = 0.0):
+    _, measurements = measured(3 * MARK, 5, missing=missing, size=5)
+    matrix, stops = dense(measurements)
+    return measurements, matrix, stops, np.linalg.pinv(matrix, rcond=1e-10)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.06])
+def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
+    measurements, matrix, stops, inverse = whole(missing)
+    model = fit_joint(measurements, ALONE)
+    noises = model.problem.images.noises(model.found.residuals)
+    assert noises.image > 2 * noises.mark > 0
+    sites = np.prod(measurements.artifact.shape)
+    gain = datum(measurements.artifact) @ inverse[:2 * sites]
+    together = np.kron(stops[:, None] == stops, np.eye(2))
+    covariance = noises.mark**2 * np.eye(len(matrix)) + noises.image**2 * together
+    u = np.sqrt(np.diag(gain @ covariance @ gain.T))
+    found = calibrate(measurements, ALONE).error_map
+    shape = measurements.artifact.shape
+    np.testing.assert_allclose(found.u_gx, u[::2].reshape(shape), rtol=1e-5)
+    np.testing.assert_allclose(found.u_gy, u[1::2].reshape(shape), rtol=1e-5)
+    alone = np.sqrt(noises.sigma**2 * np.diag(gain @ gain.T))
+    assert u.mean() > 1.8 * alone.mean()
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.06])
+def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
+    measurements, matrix, stops, inverse = whole(missing)
+    system = system_for(grid_data(measurements), angular_data(measurements))
+    images = image_noise(measurements.artifact, [v.view for v in measurements.views], system)
+    left = np.eye(len(matrix)) - matrix @ inverse
+    together = np.kron(stops[:, None] == stops, np.eye(2))
+    expected = [[np.trace(left), np.trace(left @ together @ left)],
+                [np.trace(left @ together @ left),
+                 np.trace(together @ left @ together @ left)]]
+    spread = images.drawn[:, :, :2].std(axis=0) / np.sqrt(len(images.drawn))
+    away = images.drawn[:, :, :2].mean(axis=0) - np.array(expected)
+    assert (np.abs(away) < 4 * spread).all()
+    assert images.marks == pytest.approx(np.mean([(stops == stop).sum() for stop in stops]))
+
+
+def population(image_m: float, size: int, runs: int, **settings):
+    """Return (G - truth) / (k u) of every node and run, the noises found, and the results."""
+    away, noises, results = [], [], []
+    for seed in range(runs):
+        truth, measurements = measured(image_m, seed, size=size, **settings)
+        found = calibrate(measurements)
+        emap = found.error_map
+        error = np.stack([emap.gx, emap.gy]) - truth.g
+        away.append(error / np.stack([emap.u_gx, emap.u_gy]))
+        results.append(found)
+        model = fit_joint(measurements, Options())
+        noises.append(model.problem.images.noises(model.found.residuals))
+    return np.array(away), noises, results
+
+
+@pytest.mark.parametrize(("part", "size", "sense"), [
+    (0.3, 7, Sense.MICROSCOPE_MOVES), (1.0, 11, Sense.PLATE_MOVES),
+    (3.0, 7, Sense.MICROSCOPE_MOVES)])
+def test_populations_are_covered_and_their_noises_recovered(part, size, sense):
+    runs = 40 if size == 7 else 15
+    away, noises, results = population(part * MARK, size, runs, sense=sense)
+    assert all(found.verdict.qualified for found in results)
+    inside = np.abs(away) < 2
+    # nodes of a map depend on each other: as few numbers as maps have in common with 20 of them
+    n = runs * 20
+    assert binom.ppf(1e-4, n, 0.9545) < inside.mean() * n
+    assert 0.85 < np.sqrt((away**2).mean()) < 1.08
+    mark, image = (np.mean([getattr(one, name) ** 2 for one in noises])
+                   for name in ("mark", "image"))
+    assert mark == pytest.approx(MARK**2, rel=0.06)
+    assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
+
+
+def test_noise_common_to_images_is_no_drift_or_slip():
+    _, _, results = population(3 * MARK, 5, 20, repeats=2)
+    assert not any(found.verdict.causes for found in results)
