@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public call of the estimators: readings in, calibration out."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
-from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened
+from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.known import known_plate
@@ -14,8 +17,12 @@ from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.terms import TermName, microscope_term
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
+
+CAMERA_STEPS = 3
+"""Fits from which the camera's distortion is taken, each with the readings of the one before."""
 
 
 def calibrate(measurements: Measurements, options: Options | None = None) -> CalibrationResult:
@@ -47,11 +54,35 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     options = options or Options()
     if options.plate is not None:
         return recheck(measurements, options, known_plate(options.plate, options.plate_from))
+    camera, measurements = _camera(measurements, options)
+    options = options if camera is None else _knowing(camera, options)
     solve = solve_law if options.method == "law" else solve_joint
     result = judged(solve(measurements, options), measurements, options)
     if not result.verdict.qualified:
         check_placing(measurements)
-    return result
+    return result if camera is None else replace(
+        result, extra={**result.extra, "camera": camera.to_dict()})
+
+
+def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
+    """Return the camera that images of several marks show, and the readings freed from it."""
+    straight, camera = measurements, None
+    if options.method == "law" or not any(view.view.cell for view in measurements.views):
+        return None, measurements
+    plain = replace(options, assumed=(), terms=())
+    for _ in range(CAMERA_STEPS):
+        camera = camera_of(measurements, fit_joint(straight, plain))
+        if camera is None:
+            return None, measurements
+        straight = straightened(measurements, camera)
+    return camera, straight
+
+
+def _knowing(camera: Camera, options: Options) -> Options:
+    """Return the options with what images tell of the microscope in place of what is assumed."""
+    known = microscope_term(*camera.u_linear)
+    return replace(options, assumed=tuple(
+        known if term.name is TermName.MICROSCOPE else term for term in options.assumed))
 
 
 def pure_noise(marks: int) -> Measurements:

@@ -304,10 +304,10 @@ class Image:
         hx, hy = self.nx // 2, self.ny // 2
         return [(x, y) for x in range(-hx, hx + 1) for y in range(-hy, hy + 1)]
 
-    def step_on_plate(self, cell: tuple[int, int], quarters: int,
+    def step_on_plate(self, cell: tuple[int, int], pose: "Pose",
                       artifact: Artifact) -> tuple[int, int]:
         """Return the steps (m, n) on a plate from the mark on the axis to that of a cell."""
-        step = (1, -1j, -1, 1j)[quarters % 4] * complex(*cell) * self.steps(artifact)
+        step = (1, -1j, -1, 1j)[pose.quarters % 4] * complex(*cell) * self.steps(artifact)
         return round(step.real), round(step.imag)
 
     def steps(self, artifact: Artifact) -> int:

@@ -96,9 +96,8 @@ class View:
 
     def step_on_plate(self, artifact: Artifact) -> tuple[int, int]:
         """Return the steps (m, n) on the plate from the mark on the optical axis to the cell's."""
-        if self.image is None or self.cell is None:
-            return 0, 0
-        return self.image.step_on_plate(self.cell, self.pose.quarters, artifact)
+        cell = self.cell or (0, 0)
+        return self.image.step_on_plate(cell, self.pose, artifact) if self.image else (0, 0)
 
     @property
     def plan_view(self) -> str:

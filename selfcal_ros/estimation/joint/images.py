@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
 SAMPLES = 60_000
 """Readings of all draws together, and limits of the number of draws."""
-FEWEST, MOST = 8, 64
+FEWEST, MOST = 24, 64
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,15 @@ class ImageNoise:
     drawn : float array (draws, 2, 3)
         Sums of squares of the residuals, and of the sums of images, for unit noise of marks, for
         that of images, and of both together less these.
+    parameters : float array (draws, 2, 3 views)
+        Misalignments for unit noise of marks and of images, as in `JointFit`, m.
     """
 
     stop: np.ndarray
     read: np.ndarray
     weight: np.ndarray
     drawn: np.ndarray
+    parameters: np.ndarray
 
     @property
     def marks(self) -> float:
@@ -124,43 +128,61 @@ def image_noise(artifact: Artifact, views: Sequence[View],
     system : NormalEquations
         The grid readings.
     """
-    grid = system.grid
-    mine = [views[index] for index in system.grid_index]
+    mine = tuple(views[index] for index in system.grid_index)
     if not system.direct or not any(view.cell is not None for view in mine):
         return None
-    stops = _stops(artifact, mine, grid.read)
+    key = tuple((view.plan_view, view.step_on_plate(artifact)) for view in mine)
+    return _known.get(system, key, lambda: _drawn(system, key))
+
+
+_known: Memo[tuple, ImageNoise] = Memo()
+
+
+def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]]) -> ImageNoise:
+    """Return images and draws of readings; `views` are the names in the plan and steps of cells."""
+    grid = system.grid
+    stops = _stops(views, grid.read)
     weight = grid.weight[grid.read]
     drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
-    plain = ImageNoise(stops, grid.read, weight, drawn)
+    plain = ImageNoise(stops, grid.read, weight, drawn, np.zeros((len(drawn), 2, 3 * len(views))))
     rng = np.random.default_rng(0)
-    for row in drawn:
+    for row, parameters in zip(drawn, plain.parameters, strict=True):
         mark, image = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (
             len(stops), stops.max() + 1))
-        left = [_residual(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
+        left, parameters[:] = zip(*(_solved(system, values / np.sqrt(weight))
+                                    for values in (mark, image[stops])), strict=True)
         row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
         row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
     return plain
 
 
-def _stops(artifact: Artifact, views: Sequence[View], read: np.ndarray) -> np.ndarray:
+def _stops(views: Sequence[tuple[str, tuple[int, int]]], read: np.ndarray) -> np.ndarray:
     """Return the index of the stop of each reading, int array (n,).
 
     A stop is that of a view of the plan, at the mark from which the cell is as many steps away.
     """
-    names = list(dict.fromkeys(view.plan_view for view in views))
+    names = list(dict.fromkeys(name for name, _ in views))
     view, m, n = np.nonzero(read)
-    steps = np.array([one.step_on_plate(artifact) for one in views])
-    keys = np.stack([np.array([names.index(v.plan_view) for v in views])[view],
+    steps = np.array([step for _, step in views])
+    keys = np.stack([np.array([names.index(name) for name, _ in views])[view],
                      m - steps[view, 0], n - steps[view, 1]])
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _residual(system: NormalEquations, values: np.ndarray) -> np.ndarray:
-    """Return the residuals of readings `values` (n,), grid alone, (views, nx, ny)."""
+def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (views, nx, ny) and misalignments, in the datum, of readings (n,).
+
+    Of the grid alone.
+    """
     grid = system.grid
     y = np.zeros(grid.read.shape, dtype=complex)
     y[grid.read] = values
     free, d = grid.reduced(y)
     alone = system.grid_inverse @ d
     field = (free - grid.response @ alone).reshape(grid.views.shape)
-    return grid.plate(y, field, alone)[1]
+    plate, residual = grid.plate(y, field, alone)
+    moved = np.zeros(system.size)
+    moved[:len(alone)] = alone
+    moved -= system.gauge.parts(field) @ system.rigid[:4]
+    moved -= system.plate_gauge.parts(plate) @ system.rigid[4:]
+    return residual, moved[:len(alone)]

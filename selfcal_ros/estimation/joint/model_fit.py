@@ -18,13 +18,7 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
 from selfcal_ros.estimation.joint.moving import Moving
-from selfcal_ros.estimation.joint.problem import (
-    ROUNDING,
-    Problem,
-    grid_dof,
-    noise_excess,
-    sigma_of,
-)
+from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, noise_excess, sigma_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
@@ -183,8 +177,7 @@ def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, 
     scored = score(equations, model.found.both_residuals, squares(model.problem, model.found),
                    coefficients=model.coefficients)
     right = scored.total + equations.information @ model.coefficients
-    noise = model.found.xy
-    excess = noise_excess(model.problem, model.found.residuals)
+    noise, excess = model.found.xy, noise_excess(model.problem, model.found.residuals)
     return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))
 
 

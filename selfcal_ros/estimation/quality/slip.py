@@ -26,8 +26,8 @@ from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMark
 from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import shapes_of
 from selfcal_ros.estimation.verdict.causes import cause_of
-from selfcal_ros.estimation.verdict.explanations import PlacedSlip, find_explanations
-from selfcal_ros.estimation.verdict.off_sites import SLIP
+from selfcal_ros.estimation.verdict.explanations import find_explanations
+from selfcal_ros.estimation.verdict.off_sites import SLIP, PlacedSlip
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.verdict import Cause, Finding
 

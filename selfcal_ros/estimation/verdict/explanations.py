@@ -25,6 +25,7 @@ from selfcal_ros.estimation.terms.ground import TermInputs, without_noise
 from selfcal_ros.estimation.verdict.off_sites import (
     READING,
     SLIP,
+    PlacedSlip,
     reading_columns,
     slip_columns,
 )
@@ -247,15 +248,6 @@ class Group:
     mark: tuple[int, int] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedSlip:
-    """Columns of a slip at a place known beforehand, its grid view, and number of places tried."""
-
-    columns: TermColumns
-    view: int
-    places: int
-
-
 def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
                       placed: PlacedSlip | None = None) -> list[Explanation]:
     """Return the significant explanations of the residuals of a fit, the most likely first.
@@ -295,11 +287,10 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
     prior = np.where(columns.rows(own), equations.prior(model.found.xy.sigma), 0.0)
-    pool = Candidates(equations, right, prior, taken)
-    if problem.images is not None:
-        excess = noise_excess(problem, model.found.residuals)
-        pool = replace(pool, excess=excess, common=excess * model.found.xy.residuals**2)
-    return select_explanations(pool, groups, columns.rows(own))
+    excess = noise_excess(problem, model.found.residuals)
+    common = excess * model.found.xy.residuals**2 if problem.images else 0.0
+    return select_explanations(Candidates(equations, right, prior, taken, excess, common), groups,
+                               columns.rows(own))
 
 
 def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:

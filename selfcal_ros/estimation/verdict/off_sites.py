@@ -43,6 +43,15 @@ class Suspect(NamedTuple):
     rows: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedSlip:
+    """Columns of a slip at a place known beforehand, its grid view, and number of places tried."""
+
+    columns: TermColumns
+    view: int
+    places: int
+
+
 def reading_columns(ground: TermInputs, residuals: np.ndarray,
                     phases: np.ndarray) -> tuple[TermColumns, list[Suspect]]:
     """Return the columns of the readings with the largest residuals, and these readings.

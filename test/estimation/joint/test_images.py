@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise that the marks of an image share: estimated, and in U, against dense linear algebra."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,11 +10,12 @@ from scipy.stats import binom
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.images import image_noise
-from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.view import View
+from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.plans import image_plan
@@ -80,19 +82,20 @@ def whole(missing: float = 0.0):
 @pytest.mark.parametrize("missing", [0.0, 0.06])
 def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     measurements, matrix, stops, inverse = whole(missing)
-    model = fit_joint(measurements, ALONE)
-    noises = model.problem.images.noises(model.found.residuals)
-    assert noises.image > 2 * noises.mark > 0
+    result = calibrate(measurements, ALONE)
+    camera = result.extra["camera"]
+    mark, image = camera["noise_mark"], camera["noise_image"]
+    assert image > 2 * mark > 0
     sites = np.prod(measurements.artifact.shape)
     gain = datum(measurements.artifact) @ inverse[:2 * sites]
     together = np.kron(stops[:, None] == stops, np.eye(2))
-    covariance = noises.mark**2 * np.eye(len(matrix)) + noises.image**2 * together
+    covariance = mark**2 * np.eye(len(matrix)) + image**2 * together
     u = np.sqrt(np.diag(gain @ covariance @ gain.T))
-    found = calibrate(measurements, ALONE).error_map
+    found = result.error_map
     shape = measurements.artifact.shape
     np.testing.assert_allclose(found.u_gx, u[::2].reshape(shape), rtol=1e-5)
     np.testing.assert_allclose(found.u_gy, u[1::2].reshape(shape), rtol=1e-5)
-    alone = np.sqrt(noises.sigma**2 * np.diag(gain @ gain.T))
+    alone = np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T))
     assert u.mean() > 1.8 * alone.mean()
 
 
@@ -113,38 +116,73 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
 
 
 def population(image_m: float, size: int, runs: int, **settings):
-    """Return (G - truth) / (k u) of every node and run, the noises found, and the results."""
-    away, noises, results = [], [], []
+    """Return (G - truth) / u of every node and run, and the truths and results."""
+    away, results = [], []
     for seed in range(runs):
         truth, measurements = measured(image_m, seed, size=size, **settings)
         found = calibrate(measurements)
         emap = found.error_map
         error = np.stack([emap.gx, emap.gy]) - truth.g
         away.append(error / np.stack([emap.u_gx, emap.u_gy]))
-        results.append(found)
-        model = fit_joint(measurements, Options())
-        noises.append(model.problem.images.noises(model.found.residuals))
-    return np.array(away), noises, results
+        results.append((truth, found))
+    return np.array(away), results
+
+
+def within(away: np.ndarray, independent: int) -> None:
+    """Assert that about 95.45 % lie within 2 u; `independent`: numbers that a run has."""
+    n = len(away) * independent
+    assert binom.ppf(1e-4, n, 0.9545) <= (np.abs(away) < 2).mean() * n
+    assert 0.9 < np.sqrt((away**2).mean()) < 1.1
+
+
+def away_of(truth, camera) -> np.ndarray:
+    """Return (error of the camera - truth) / u at every cell, (2, cells)."""
+    place, error, u = (np.array([[cell[f"{name}{axis}"] for cell in camera["cells"]]
+                                 for axis in "xy"]) for name in ("", "d", "u_d"))
+    return (error - (physics.seen_offset(truth, place) - place)) / u
+
+
+DISTORTED = {"microscope_distortion": 0.02, "microscope_field_m": 1.414e-3,
+             "microscope_scale": 0.005, "microscope_rotation_rad": -0.003}
+"""2 % in the corner of the image, and an error of scale and turn."""
 
 
 @pytest.mark.parametrize(("part", "size", "sense"), [
     (0.3, 7, Sense.MICROSCOPE_MOVES), (1.0, 11, Sense.PLATE_MOVES),
     (3.0, 7, Sense.MICROSCOPE_MOVES)])
-def test_populations_are_covered_and_their_noises_recovered(part, size, sense):
-    runs = 40 if size == 7 else 15
-    away, noises, results = population(part * MARK, size, runs, sense=sense)
-    assert all(found.verdict.qualified for found in results)
-    inside = np.abs(away) < 2
-    # nodes of a map depend on each other: as few numbers as maps have in common with 20 of them
-    n = runs * 20
-    assert binom.ppf(1e-4, n, 0.9545) < inside.mean() * n
-    assert 0.85 < np.sqrt((away**2).mean()) < 1.08
-    mark, image = (np.mean([getattr(one, name) ** 2 for one in noises])
-                   for name in ("mark", "image"))
+def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense):
+    away, results = population(part * MARK, size, 40 if size == 7 else 15, sense=sense, **DISTORTED)
+    assert all(found.verdict.qualified for _, found in results)
+    within(away, 20)
+    cameras = [found.extra["camera"] for _, found in results]
+    within(np.array([away_of(truth, found.extra["camera"]) for truth, found in results]), 9)
+    assert all(camera["degree"] == 3 for camera in cameras)
+    mark, image = (np.mean([camera[name] ** 2 for camera in cameras])
+                   for name in ("noise_mark", "noise_image"))
     assert mark == pytest.approx(MARK**2, rel=0.06)
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
+    for camera in cameras:  # published offsets are (1 + E)^-1 times the true ones, then distorted
+        assert camera["scale"] == pytest.approx(-0.005, abs=1e-4)
+        assert camera["rotation"] == pytest.approx(0.003, abs=1e-4)
+        radial = next(c["x"] for c in camera["coefficients"] if c["power"] == [2, 1])
+        assert radial == pytest.approx(0.02 / 1.414e-3**2, rel=0.03)
 
 
-def test_noise_common_to_images_is_no_drift_or_slip():
-    _, _, results = population(3 * MARK, 5, 20, repeats=2)
-    assert not any(found.verdict.causes for found in results)
+def test_a_camera_without_distortion_has_a_linear_error():
+    _, results = population(MARK, 5, 12, repeats=2)
+    cameras = [found.extra["camera"] for _, found in results]
+    assert sum(camera["degree"] == 1 for camera in cameras) >= 11
+    assert not any(found.verdict.causes for _, found in results)
+    scale = [camera["scale"] / camera["u_scale"] for camera in cameras]
+    assert np.sqrt(np.mean(np.square(scale))) < 1.8
+
+
+def test_images_in_one_line_show_no_distortion_of_the_camera():
+    plan, rng = image_plan(5), np.random.default_rng(2)
+    image = replace(plan.views[0].image, ny=1)
+    more = View("shifted", 0.0, (0.0, 1e-3), angular=False)
+    plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
+    truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=0.003))
+    found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=MARK))
+    assert "camera" not in found.extra
+    assert found.observability.identifiable
