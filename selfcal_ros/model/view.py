@@ -89,11 +89,6 @@ class View:
             return 0j
         return self.pose.rows * complex(*self.cell) * self.image.pitch_m
 
-    @property
-    def image_cells(self) -> list[tuple[int, int]]:
-        """The cells of the image in their order; none without images."""
-        return self.image.cells if self.image is not None else []
-
     def step_on_plate(self, artifact: Artifact) -> tuple[int, int]:
         """Return the steps (m, n) on the plate from the mark on the optical axis to the cell's."""
         cell = self.cell or (0, 0)

@@ -13,6 +13,7 @@ from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
+from selfcal_ros.reporting.figures.camera import camera_errors
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
@@ -28,6 +29,7 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
+from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned_numbers,
@@ -48,7 +50,7 @@ MAX_ROWS = 200
 TITLES = {"outliers": "Marks removed or weighted down", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
-DRAWN = {"residuals", "rejected_at"}
+DRAWN = {"residuals", "rejected_at", "camera"}
 """Extras that are drawn, not tabulated."""
 _UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
           ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
@@ -252,6 +254,9 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
     found = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
         _causes(result), _maps(result, truth), _uncertainty(result), *more, _plate(result),
+        Chapter("Camera", _figures((camera_errors(result), "Each vector leads from where a mark is "
+                                    "in the image to where the camera puts it.")),
+                (Section("Camera", camera_facts(result)),)),
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
             (plan_figure(result.plate, views_in(result)) if result.views else None,

@@ -101,11 +101,13 @@ def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
         return None
     problem, grid = model.problem, model.problem.system.grid
     views = [measurements.views[index].view for index in problem.grid.index]
-    cells = views[0].image_cells
+    image = views[0].image
+    if image is None or min(image.nx, image.ny) < 3:
+        return None
+    cells = image.cells
     names = list(dict.fromkeys(view.plan_view for view in views))
     order = {(view.plan_view, view.cell): row for row, view in enumerate(views)}
-    if any((name, cell) not in order for name in names for cell in cells) or (
-            min(views[0].image.nx, views[0].image.ny) < 3 if views[0].image else True):
+    if any((name, cell) not in order for name in names for cell in cells):
         return None
     rows = np.array([[order[name, cell] for cell in cells] for name in names])
     middle = cells.index((0, 0))
@@ -175,8 +177,8 @@ def _place(views: Sequence[ViewReadings]) -> complex:
 
 def straightened(measurements: Measurements, camera: Camera) -> Measurements:
     """Return the readings with the camera's error in each cell that of its mean offset."""
-    cells = next(view.view.image_cells for view in measurements.views if view.view.cell)
-    places = dict(zip(cells, camera.place + camera.error, strict=True))
+    image = next(view.view.image for view in measurements.views if view.view.image)
+    places = dict(zip(image.cells, camera.place + camera.error, strict=True))
     return replace(measurements, views=tuple(
         view if view.view.cell is None or view.visits is None
         else _straight(view, view.visits, camera, places[view.view.cell])

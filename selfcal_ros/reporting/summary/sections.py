@@ -13,6 +13,7 @@ from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned,
@@ -50,7 +51,8 @@ def all_sections(result: CalibrationResult,
                  truth: Mapping[str, np.ndarray] | None = None) -> list[Section]:
     """Return the sections of a summary in reading order."""
     sections = [verdict_section(result), measurement_section(result), views_section(result),
-                error_section(result), terms_section(result), noise_section(result.noise)]
+                error_section(result), terms_section(result), noise_section(result.noise),
+                Section("Camera", camera_facts(result))]
     if truth is not None:
         sections.append(truth_section(result.error_map, truth))
     sections += [rejected_section(result), attention_section(result)]

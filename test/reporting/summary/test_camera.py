@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera in summary and report: numbers of the result, arrows; nothing where there is none."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.reporting.chapters import chapters
+from selfcal_ros.reporting.figures.camera import camera_errors
+from selfcal_ros.reporting.summary.camera import camera_facts, cells_of
+from selfcal_ros.reporting.summary.sections import summary_text
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
+from test.support.plans import image_plan
+
+
+@cache
+def result():
+    plan, rng = image_plan(5), np.random.default_rng(4)
+    truth = random_truth(plan.artifact, 2, rng, Spread(
+        phi_rad=0.003, correlation_pitches=4.0, microscope_distortion=0.01,
+        microscope_field_m=1e-3, microscope_scale=0.004))
+    measured = simulate_measurements(truth, plan, rng, settings=CellSettings(
+        sigma_xy_m=2e-8, image_xy_m=4e-8, servo_sigma_m=0.0))
+    made = worded(calibrate(measured))
+    return result_from_dict(result_to_dict(made), "test")
+
+
+def test_the_summary_states_the_camera():
+    facts = dict(camera_facts(result()))
+    assert facts["scale"].startswith("-0.39")
+    assert facts["distortion"] == "radial (cubic)"
+    assert facts["largest error"].endswith("mm of the image")
+    assert "Camera" in summary_text(result())
+    assert "scale           -0.39" in summary_text(result())
+
+
+def test_the_report_draws_its_errors():
+    (chapter,) = [c for c in chapters(result(), None) if c.title == "Camera"]
+    assert len(chapter.figures) == 1
+    drawing = camera_errors(result())
+    spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
+    assert len(spots) == 9
+    dx = result().extra["camera"]["cells"][0]["dx"]
+    assert f"{dx * 1e6:.1f} ±" in spots[0].title
+
+
+@pytest.mark.parametrize("camera", [None, {}, {"cells": []}, {"cells": [{"x": 1}]}, [1], {
+    "cells": [dict.fromkeys(("x", "y", "dx", "dy", "u_dx", "u_dy"), "far")]}])
+def test_without_a_camera_nothing_is_shown(camera):
+    extra = {**result().extra, "camera": camera}
+    other = replace(result(), extra=extra)
+    assert cells_of(other).shape == (6, 0)
+    assert camera_facts(other) == ()
+    assert camera_errors(other) is None
+    assert "Camera" not in summary_text(other)
