@@ -96,7 +96,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
         if alone is not None and seen.identifiable:
-            terms = (*model, *plan_terms.assumed_terms(args.model, model))
+            terms = (*model, *plan_terms.assumed_terms(args.model, model, plan))
             budget = plan_budget(plan, terms, assumed, alone, asked=[term.name for term in model])
     if args.json:
         found = _check_json(plan, seen, alone, maps=args.map)
@@ -209,6 +209,8 @@ def _image_text(plan: Plan) -> list[str]:
 
 def _check_stops_text(plan: Plan) -> str:
     marks, offset_m = plan.check_stops
+    if not marks and plan_terms.tells_camera(plan):
+        return "no check stops: images show scale, turn, distortion and sign of the camera"
     if not marks:
         return ("no check stops: only stop errors and turns of the plate show scale, turn and sign "
                 "of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
@@ -316,7 +318,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
     found |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
     named = tuple(found[n] for n in TermName if n in found)
-    by_default = plan_terms.assumed_terms(args.against, named)
+    by_default = plan_terms.assumed_terms(args.against, named, plan)
     return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 
 

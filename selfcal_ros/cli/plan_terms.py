@@ -144,7 +144,8 @@ def _named(given: list[str]) -> list[str]:
     return [text for text in given if text != NO_TERMS]
 
 
-def assumed_terms(given: list[str], named: tuple[ModelTerm, ...]) -> tuple[ModelTerm, ...]:
+def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
+                  plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms that are assumed by default beside the named ones.
 
     Parameters
@@ -153,12 +154,20 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...]) -> tuple[Model
         What ``--model`` or ``--against`` says: ``none`` excludes them.
     named : tuple of ModelTerm
         Terms of the plan and of the option.
+    plan : Plan
+        The plan: its images may tell the microscope better than it is known.
     """
-    from selfcal_ros.model.terms import DEFAULT_TERMS
+    from selfcal_ros.model.terms import DEFAULT_TERMS, TermName
 
-    names = {term.name for term in named}
+    names = {term.name for term in named} | ({TermName.MICROSCOPE} if tells_camera(plan) else set())
     return () if _is_none(given) else tuple(
         term for term in DEFAULT_TERMS if term.name not in names)
+
+
+def tells_camera(plan: Plan) -> bool:
+    """Return whether the images of a plan tell the camera's scale, turn and distortion."""
+    images = [view.image for view in plan.views if view.grid]
+    return bool(images) and all(image and min(image.nx, image.ny) >= 3 for image in images)
 
 
 def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, Any]:

@@ -359,3 +359,26 @@ def test_a_large_field_is_said_to_be_predicted_on_a_smaller_one(monkeypatch):
     assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == (
         "predicted for a field of 5 x 5 sites; XY is about 5 % larger for each doubling of the "
         "field")
+
+
+def test_images_tell_the_camera_and_suffice_with_two_turns(tmp_path, capsys):
+    plan = {"plan_id": "camera", "artifact": {"grid_size": 7, "grid_pitch": 1e-3,
+                                              "angular_count": 0},
+            "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}],
+            "image": {"nx": 3, "ny": 3}}
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump(plan))
+    assert main(["plan", "check", str(tmp_path / "p.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert "images of 3 x 3 marks" in told
+    assert "images show scale, turn, distortion and sign of the camera" in told
+    assert main(["plan", "check", str(tmp_path / "p.yaml"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["predicted"]["rms_gain_xy"] == pytest.approx(0.2744, abs=1e-4)
+    assert "microscope" not in [line["component"] for line in found["budget"]["lines"]]
+    plan["views"] = plan["views"][:1]
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump(plan))
+    assert main(["plan", "check", str(tmp_path / "p.yaml")]) == 3
+    assert main(["plan", "suggest", str(tmp_path / "p.yaml"), "-o", str(tmp_path / "q.yaml")]) == 0
+    better = plan_from_dict(read_yaml(tmp_path / "q.yaml"), "q")
+    assert better.views[1].image == better.views[0].image
+    assert better.views[1].image.nx == 3
