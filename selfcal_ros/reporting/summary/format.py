@@ -7,6 +7,8 @@ import unicodedata
 from collections.abc import Sequence
 from typing import TextIO
 
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
+
 UNKNOWN = "–"
 _NUMBER = re.compile(r"[−+-]?\d[\d.]*(e[+-]?\d+)?|–|many")
 _ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
@@ -46,6 +48,18 @@ def significant(value: float, digits: int = 3) -> str:
     if not -4 <= exponent < 7:
         return f"{value:.{digits - 1}e}"
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+
+
+def um(value_m: float) -> str:
+    """Return a length in µm with its unit, or ``not known``."""
+    return f"{significant(value_m * UM_PER_M)} µm" if math.isfinite(value_m) else "not known"
+
+
+def arcsec(value_rad: float) -> str:
+    """Return an angle in arcseconds with its unit, or ``not known``."""
+    if not math.isfinite(value_rad):
+        return "not known"
+    return f"{significant(value_rad * ARCSEC_PER_RAD)} arcsec"
 
 
 def fixed(value: float, decimals: int) -> str:

@@ -18,6 +18,7 @@ from selfcal_ros.reporting.summary.format import (
     UNKNOWN,
     aligned,
     aligned_numbers,
+    arcsec,
     counted,
     decimals_for,
     fixed,
@@ -26,6 +27,7 @@ from selfcal_ros.reporting.summary.format import (
     printable,
     significant,
     to_ascii,
+    um,
 )
 from selfcal_ros.reporting.summary.numbers import (
     MapFigures,
@@ -315,18 +317,6 @@ def attention_section(result: CalibrationResult) -> Section:
     lines += [f"advice: {printable(advice)}" for advice in seen.advice]
     lines += [f"warning: {printable(warning)}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
-
-
-def um(value_m: float) -> str:
-    """Return a length in µm with its unit, or ``not known``."""
-    return f"{significant(value_m * UM_PER_M)} µm" if math.isfinite(value_m) else "not known"
-
-
-def arcsec(value_rad: float) -> str:
-    """Return an angle in arcseconds with its unit, or ``not known``."""
-    if not math.isfinite(value_rad):
-        return "not known"
-    return f"{significant(value_rad * ARCSEC_PER_RAD)} arcsec"
 
 
 def state_sentence(result: CalibrationResult) -> str:
