@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's distortion from images that show several marks (method eq. 4.15).
+"""The camera's distortion from images that show several marks (method eq. 4.16).
 
 The offset of each cell of the image holds the camera's error there. A polynomial through the cells
 straightens offsets between them; its degree is the smallest that the cells do not contradict.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise that the marks of an image share, beside that of each mark (method eq. 4.14).
+"""Noise that the marks of an image share, beside that of each mark (method eq. 4.15).
 
 Vibration and noise of the encoders move all marks of an image together. Such noise looks like an
 error of the stage, so that residuals show only part of it. Both noises follow from two sums of
