@@ -122,7 +122,7 @@ class Camera:
         size = self.mark_size_m / self.pixel_size_m
         for (u, v), angle in zip(self.pixels_of(offsets).T, np.broadcast_to(
                 angles, offsets.shape[1]), strict=True):
-            self._add(grey, u, v, size, self._pixel_angle(float(angle)), sign * self.contrast)
+            self._add(grey, u, v, size, np.deg2rad(self.turn_deg) - angle, sign * self.contrast)
         for _ in range(rng.poisson(self.dirt) if self.dirt else 0):
             u, v = rng.uniform(0, self.width), rng.uniform(0, self.height)
             self._speck(grey, u, v, 2 * size * rng.uniform(*DIRT_RADIUS))
@@ -131,11 +131,6 @@ class Camera:
         value = (light + spread * rng.normal(size=light.shape)) * self.full_scale
         return np.clip(np.rint(value), 0, self.full_scale).astype(
             np.uint16 if self.encoding == "mono16" else np.uint8)
-
-    def _pixel_angle(self, angle: float) -> float:
-        """Return a direction in stage axes as an angle from columns to rows."""
-        turned = angle - np.deg2rad(self.turn_deg)
-        return np.pi + turned if self.mirror else -turned
 
     def _lighting(self) -> np.ndarray:
         v, u = np.mgrid[0:self.height, 0:self.width]
@@ -167,7 +162,8 @@ class Camera:
             return
         step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
         b, a = np.meshgrid(step - (v - row), step - (u - column), indexing="ij")
-        cosine, sine = np.cos(angle), np.sin(angle)
+        a = -a if self.mirror else a
+        cosine, sine = np.cos(angle), np.sin(angle)  # from columns to rows
         cover = np.clip(0.5 + FINE * inside(cosine * a + sine * b, cosine * b - sine * a), 0, 1)
         cover = ndimage.gaussian_filter(cover, self.blur_px * FINE, truncate=5.0, mode="nearest")
         pixels = cover.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean(axis=(1, 3))

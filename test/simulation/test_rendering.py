@@ -70,3 +70,12 @@ def test_dirt_is_dark_and_counted_on_average():
 def test_a_mark_outside_of_the_image_does_not_show():
     for away in ((1e-3, 0.0), (-1e-3, 1e-3), (0.0, -1e-3)):
         assert (grey(PLAIN, np.array([away]).T) == grey(replace(PLAIN, contrast=0.0))).all()
+
+
+def test_a_mirrored_camera_shows_the_mirrored_image():
+    camera = replace(PLAIN, mark="corner", turn_deg=10.0)
+    away = np.array([[2e-5], [1e-5]])
+    straight = grey(camera, away, angles=0.4)
+    assert np.abs(straight - straight[:, ::-1]).max() > 0.5
+    mirrored = grey(replace(camera, mirror=True), away, angles=0.4)
+    assert mirrored == pytest.approx(straight[:, ::-1], abs=2e-5)

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The noise of pixels, and the uncertainty of a centre where bright pixels are much noisier."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.vision.fitting import fitted, window_of
+from selfcal_ros.vision.models import MODELS
+
+
+def test_bright_pixels_that_are_noisier_weigh_less():
+    """Noise 1 in the dark, 20 in the light: chi² of 60 centres by their own uncertainty."""
+    model, rng, ratios = MODELS["disc"], np.random.default_rng(7), []
+    v, u = np.mgrid[:61, :61].astype(float)
+    for _ in range(60):
+        away = rng.uniform(-0.5, 0.5, 2)
+        shape = model.shape((u - 30 - away[0]).ravel(), (v - 30 - away[1]).ravel(),
+                            np.array([24.0, 3.0]))[0].reshape(u.shape)
+        image = 200 - 150 * shape + rng.normal(size=u.shape) * (20 - 19 * shape)
+        fit = fitted(model, window_of(image, 30, 30, 20.0), np.array([24.0, 2.0]))
+        ratios.append((fit.centre - away) / np.sqrt(np.diagonal(fit.covariance)))
+    square = np.square(ratios)
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / square.size)
+    assert np.sqrt(np.diagonal(fit.covariance)) == pytest.approx([0.05, 0.05], abs=0.02)
