@@ -130,15 +130,3 @@ def _columns(text: str) -> int:
 
 def _fill(cell: str, width: int) -> str:
     return " " * (width - _columns(cell))
-
-
-def um(value_m: float) -> str:
-    """Return a length in µm with its unit, or ``not known``."""
-    return f"{significant(value_m * UM_PER_M)} µm" if math.isfinite(value_m) else "not known"
-
-
-def arcsec(value_rad: float) -> str:
-    """Return an angle in arcseconds with its unit, or ``not known``."""
-    if not math.isfinite(value_rad):
-        return "not known"
-    return f"{significant(value_rad * ARCSEC_PER_RAD)} arcsec"
