@@ -30,6 +30,7 @@ from selfcal_ros.nodes.callbacks import Guarded
 from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
@@ -38,6 +39,7 @@ from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions.health import Refusals
 from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.cameras import DETECTS
 from test.support.hostile import TEXTS, torn, worst
 from test.support.maps import random_map, result_of
 from test.support.plans import plan_of
@@ -50,6 +52,7 @@ TEXT_FIELDS = ("stamp.sec", "nanosec", "_id", "view_name", "reasons", "_terms", 
 HEARD_BY = {EncoderSample: (names.ENCODER, 3), Detection: (names.DETECTIONS, 2),
             Command: (names.COMMAND, 5)}
 """How many of the nodes hear what a cell says."""
+IMAGES = names.image_topics("raw", 100)[0]
 LATER_NS = 10_000_000_000_000_000
 """How much later the good run is than the hostile one."""
 AT_ONCE = 20
@@ -115,6 +118,7 @@ def all_kinds(graph, cell, tmp_path):
     (tmp_path / "beside").mkdir()
     bag = str(small_bag(tmp_path / "beside"))
     graph.node(partial(StageSimulator, namespace="beside"))
+    graph.node(partial(MarkDetectorNode, namespace="beside"), **DETECTS)
     graph.node(partial(BagPlayer, namespace="beside"), bag=bag, wait_for_subscribers=3600.0)
     graph.node(partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0))
     graph.add(ReplaySession(partial(Player, bag=bag, rate=1.0, seed=-1), "none.json",
@@ -209,6 +213,8 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
                for node, topic, message in (
         ("measurement_collector", names.RECEIVED, names.RECEIVED.type(data=[1, 2, 3])),
         ("solver", names.SOLVED, names.SOLVED.type(data="digest")))]
+    image = from_model.image(np.full((40, 40), 90), "mono8", 10**8, "camera")
+    strange.append((IMAGES, [message for _, message in worst(fill(IMAGES.type(), image))]))
     heard = set().union(*map(subscribed, all_kinds))
     for space in ("/beside", "/replay"):
         for topic, messages in [*((topic, hostile_to(topic, fields)) for topic, fields in good),
