@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -67,9 +68,14 @@ PARTS: dict[str, Callable[[int], tuple[Recording, Truth]]] = {
     ENCODER: encoder_part, DETECTIONS: detection_part}
 
 
+MESSAGES = Path(__file__).parents[2] / "msg_defs" / "msg"
+"""Definitions of the messages: a bag of older ones is not read by today's."""
+
+
 def prepared(benchmark: str, number: int, folder: Path) -> tuple[Path, int]:
     """Return the bag of a benchmark and its messages; it is written if it is not there."""
-    bag = folder / f"{benchmark.replace(' ', '_')}_{number}"
+    messages = b"".join(path.read_bytes() for path in sorted(MESSAGES.glob("*.msg")))
+    bag = folder / f"{benchmark.replace(' ', '_')}_{number}_{zlib.crc32(messages):08x}"
     done = bag / "done.json"
     if not done.exists():
         shutil.rmtree(bag, ignore_errors=True)
