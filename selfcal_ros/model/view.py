@@ -397,4 +397,3 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
             **({"image": dict(vars(image))} if image else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
             **({"artifact_from": plan.artifact_from} if plan.artifact_from else {})}
-

@@ -5,11 +5,11 @@ import io
 import json
 from pathlib import Path
 
+import mcap.reader
+import mcap.writer
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from PIL import Image
 
 from selfcal_ros.bagio.images.bags import ImageBag
@@ -53,7 +53,7 @@ def contents(folder, topic):
     """Return log time and bytes of the messages of a topic, by the library's own reader."""
     with next(Path(folder).glob("*.mcap")).open("rb") as file:
         return [(message.log_time, message.data) for _, channel, message in
-                make_reader(file).iter_messages() if channel.topic == topic]
+                mcap.reader.make_reader(file).iter_messages() if channel.topic == topic]
 
 
 def detect(bag, output, *more):
@@ -182,7 +182,7 @@ def test_parameters_come_from_a_file_of_the_nodes(bag, tmp_path):
 
 def test_topics_of_foreign_types_are_kept(bag, tmp_path):
     with (tmp_path / "foreign.mcap").open("wb") as file:
-        writer = Writer(file)
+        writer = mcap.writer.Writer(file)
         writer.start("ros2")
         schema = writer.register_schema("odd_msgs/msg/Odd", "ros2msg", b"float64 x")
         odd = writer.register_channel("/odd", "cdr", schema, {"offered_qos_profiles": ": : ["})
