@@ -48,7 +48,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if result.method == "law":
         law, both = law_covariance(result), np.tile(known.ravel(), 2)
         return (u**2, False) if law is None else (_sized(law[0][np.ix_(both, both)], u), True)
-    if tells_what_was_read(result) and result.model.terms and KEY not in result.extra:
+    if _lacks_terms(result):
         return u**2, False
     rows = unit_rows(known)
     if is_flipped(result):
@@ -61,6 +61,11 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     cover = _exact_field(result, system).of(rows)
     factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
     return _sized(cover + factors.T @ factors, u), True
+
+
+def _lacks_terms(result: CalibrationResult) -> bool:
+    """Return whether the uncertainty has contributions of terms that the result does not keep."""
+    return bool(tells_what_was_read(result) and result.model.terms and KEY not in result.extra)
 
 
 def unit_rows(known: np.ndarray) -> np.ndarray:
@@ -119,9 +124,12 @@ def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def first_order_u(result: CalibrationResult) -> tuple[float, float]:
-    """Return the standard uncertainties of O and R of a map; NaN if unknown."""
+    """Return the standard uncertainties of O and R of a map; NaN if unknown.
+
+    Of a large field the contribution of the terms is not kept, and noise alone would be too little.
+    """
     system = system_behind(result)
-    if system is None:
+    if system is None or _lacks_terms(result):
         return float("nan"), float("nan")
     length = result.plate.grid_pitch_m * max(result.plate.half)
     if tells_what_was_read(result):

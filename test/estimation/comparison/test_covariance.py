@@ -85,6 +85,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
     alone = replace(saved, extra={})
     assert xy_covariance(alone, known)[1] is False
+    assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
 
 
 @pytest.mark.parametrize(("read", "message"), [
