@@ -45,9 +45,9 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
             and (visited or term.name not in VISIT_TERMS)]
     columns = term_columns(problem.ground, (*problem.terms, *more), problem.drift_degree)
     equations = equations_of(problem, model.found, columns)
-    lines = []
+    held, lines = model.covariance, []
     for term in more:
-        variance = _increase(equations, columns.rows([term.name]), model)
+        variance = _increase(equations, columns.rows([term.name]), held, model.found.xy.sigma)
         lines.append(BudgetLine(
             "xy", f"term {term.name}", "B", float("nan"), term.size, UNITS[term.name],
             float(np.sqrt(variance.mean())), float(np.sqrt(variance.max())), np.inf, "excluded"))
@@ -55,14 +55,16 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
                         key=lambda line: -line.effect_rms))
 
 
-def _increase(equations: TermEquations, rows: np.ndarray, model: ModelFit) -> np.ndarray:
+def _increase(equations: TermEquations, rows: np.ndarray, held: np.ndarray,
+              sigma: float) -> np.ndarray:
     """Return what the columns `rows` add to the variance of the known nodes, (2, nodes), m^2.
 
-    With C the covariance of the model's own coefficients, M the information and F the maps of the
-    columns: (F_t - F C M_t) (M_tt + 1/size^2 - M_t' C M_t)^-1 (F_t - F C M_t)'.
+    With C = `held` the covariance of the model's own coefficients, which come first, M the
+    information and F the maps of the columns:
+    (F_t - F C M_t) (M_tt + 1/size^2 - M_t' C M_t)^-1 (F_t - F C M_t)'.
     """
-    sigma, own = model.found.xy.sigma, slice(len(model.coefficients))
-    couple = model.covariance @ equations.unbiased[own][:, rows]
+    own = slice(len(held))
+    couple = held @ equations.unbiased[own][:, rows]
     size = equations.columns.size[rows]  # in whose units the coefficients are of equal order
     left = equations.unbiased[np.ix_(rows, rows)] - equations.unbiased[rows][:, own] @ couple
     left = left * np.outer(size, size) + max(sigma, LEAST_NOISE_M) ** 2 * np.eye(len(size))
