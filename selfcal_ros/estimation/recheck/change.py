@@ -14,6 +14,7 @@ from scipy.special import stdtr
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
+    PITCH_TOLERANCE,
     Significance,
     significance,
 )
@@ -24,9 +25,6 @@ from selfcal_ros.estimation.recheck.views import Gain
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.statistics import MANY_DOF, rms
-
-SAME = 1e-9
-"""Largest relative difference of pitches of maps with the same nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +181,7 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     """
     kept, old = plate.kept.sites, plate.result.artifact
     if artifact.shape == old.shape and abs(
-            artifact.grid_pitch_m / old.grid_pitch_m - 1) < SAME:
+            artifact.grid_pitch_m / old.grid_pitch_m - 1) < PITCH_TOLERANCE:
         return np.eye(kept.size)[:, kept.ravel()], kept, kept
     grid = plate.result.plate.map_grid
     how = Interpolation.BICUBIC if grid is None else grid.interpolation

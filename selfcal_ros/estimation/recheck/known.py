@@ -6,15 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.maps import PITCH_TOLERANCE
 from selfcal_ros.estimation.comparison.together import Together, together
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName
-
-SAME_PITCH = 1e-9
-"""Largest relative difference of pitches that are the same."""
+from selfcal_ros.units import MM_PER_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,7 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     """
     mine, other = measurements.artifact, plate.result.plate
     if (mine.shape, mine.angular_count) != (other.shape, other.angular_count) or abs(
-            mine.grid_pitch_m / other.grid_pitch_m - 1) > SAME_PITCH:
+            mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
         raise InputError(plate.where, f"its plate has {_said(other)}, the one that was read "
                          f"{_said(mine)}", "name the result of this plate")
     if mine.map_grid is None and other.map_grid is not None:
@@ -102,5 +101,5 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
 
 def _said(artifact: Artifact) -> str:
     nx, ny = artifact.shape
-    return (f"{nx} x {ny} marks {artifact.grid_pitch_m * 1e3:g} mm apart and "
+    return (f"{nx} x {ny} marks {artifact.grid_pitch_m * MM_PER_M:g} mm apart and "
             f"{artifact.angular_count} lines")
