@@ -12,9 +12,7 @@ where NODES.yaml says `mark_detector: {ros__parameters: {pixel_size: 2.0e-6, mar
 """
 
 import numpy as np
-import rclpy
-from cell import Cell
-from rclpy.executors import ExternalShutdownException
+from cell import Cell, main
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from selfcal_msgs.msg import MarkDetection
 from sensor_msgs.msg import Image
@@ -56,16 +54,5 @@ class CameraCell(Cell):
         self._images.publish(image)
 
 
-def main() -> None:
-    """Run the cell until Ctrl-C."""
-    rclpy.init()
-    try:
-        rclpy.spin(CameraCell())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
-
-
 if __name__ == "__main__":
-    main()
+    main(CameraCell)

@@ -209,11 +209,11 @@ class Cell(Node):
         self._marks.publish(seen)
 
 
-def main() -> None:
-    """Run the cell until Ctrl-C."""
+def main(kind: type[Cell] = Cell) -> None:
+    """Run a cell until Ctrl-C."""
     rclpy.init()
     try:
-        rclpy.spin(Cell())
+        rclpy.spin(kind())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
