@@ -14,6 +14,7 @@ from selfcal_ros.estimation.observability.suggest import rank_next
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
 from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.options import BARE, bare
@@ -29,11 +30,11 @@ def plan(count, lines=1):
         View("lines", lines * math.tau / count, grid=False, repeats=3)))
 
 
-def measured(count, seed=1, sigma_rad=SIGMA_RAD, lines=1):
+def measured(count, seed=1, sigma_rad=SIGMA_RAD, lines=1, sense=Sense.MICROSCOPE_MOVES):
     rng, views = np.random.default_rng(seed), plan(count, lines)
     truth = random_truth(views.artifact, 4, rng, Spread(phi_rad=1e-3))
     return truth, simulate_measurements(truth, views, rng, sigma_m=20e-9 * bool(sigma_rad),
-                                        sigma_theta_rad=sigma_rad)
+                                        sigma_theta_rad=sigma_rad, sense=sense)
 
 
 def error_of(result, truth):
@@ -41,9 +42,10 @@ def error_of(result, truth):
     return error - error.mean()
 
 
+@pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("count", [3, 7, 10, 30, 90])
-def test_readings_without_noise_give_the_truth(count):
-    truth, readings = measured(count, sigma_rad=0.0)
+def test_readings_without_noise_give_the_truth(count, sense):
+    truth, readings = measured(count, sigma_rad=0.0, sense=sense)
     result = calibrate(readings, BARE)
     assert np.abs(error_of(result, truth)).max() < 1e-12
     assert result.artifact_map.a_theta == pytest.approx(
