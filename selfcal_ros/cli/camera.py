@@ -2,6 +2,7 @@
 """``selfcal camera init``: size of the pixels, turn and mirror from a few moves of the stage."""
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,10 @@ def run(args: argparse.Namespace) -> int:
         "pixel_size": 1.0, "mark_size": float(args.mark_pixels), "mark": args.mark,
         "polarity": args.polarity}, "--mark-pixels"), "--mark-pixels")  # offsets in pixels
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
+    counts = detector.counts
+    if counts.empty:
+        print(f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
+              "and are left out", file=sys.stderr)
     found = camera_pose(positions, images, Sense(args.sense))
     values = {"pixel_size": found.pixel_size_m, "turn": math.degrees(found.turn_rad),
               "mirror": found.mirror, "mark": args.mark, "mark_size": args.mark_size,
@@ -89,12 +94,15 @@ def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
 
     stamps, track = encoder_track(args.bag)
     exposed, images = [], []
-    for item in ImageBag(Path(args.bag)).items():
+    bag = ImageBag(Path(args.bag))
+    for item in bag.items():
         if item.image is not None:
             found = detector.take(item.image)
             if found:
                 exposed.append(found[0].stamp_ns)
                 images.append(np.array([(mark.offset_x, mark.offset_y) for mark in found]))
+    for line, count in bag.lost.items():
+        print(f"selfcal camera: {args.bag}: {count} x {line}", file=sys.stderr)
     if not exposed or not len(stamps):
         raise NoDataError(args.bag, "no image with a mark, or no stage/joint_states",
                           "check mark, polarity and --mark-pixels")

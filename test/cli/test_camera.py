@@ -86,6 +86,27 @@ def test_the_detector_takes_the_file_that_it_writes(tmp_path):
                  str(tmp_path / "nodes.yaml")]) == 0
 
 
+def test_images_that_are_not_used_are_said(tmp_path, capsys, monkeypatch):
+    """One image shows no mark, and one message is torn."""
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
+    images = views(camera)
+    images[4] = np.full_like(images[4], 90)
+    monkeypatch.setattr(f"{__name__}.views", lambda *_: images)
+    write = BagWriter.write
+
+    def torn(self, topic, message, stamp_ns):
+        if topic.endswith(IMAGE_TOPICS["raw"]) and stamp_ns == 4 * 10**9:
+            self.write_raw(topic, b"\0\1\0\0", stamp_ns)
+        else:
+            write(self, topic, message, stamp_ns)
+    monkeypatch.setattr(BagWriter, "write", torn)
+    bag_of(tmp_path / "bag", camera)
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 0
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'bag'}: 1 of 4 images show no mark and are left out" in said
+    assert "1 x messages on /stage/image could not be decoded" in said
+
+
 def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(f"{__name__}.MOVES", [(0.0, 0.0), (3e-5, 0.0), (6e-5, 0.0)])
     bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
