@@ -81,7 +81,11 @@ def run(args: argparse.Namespace) -> int:
             records = compared(records, folder, baseline, args.baseline)
         found = series_of(records)
         lines = summary_lines(records, found, before)
-        lines += [sentence(records, args.baseline)] if baseline is not None else []
+        if baseline is not None:
+            lines += [sentence(records, args.baseline)]
+            if others := sum("baseline" not in r and bool(r.get("quantities")) for r in records):
+                lines += ["maps not compared, of another lattice or with too few nodes in common: "
+                          f"{others}"]
         content = batch_json(records, found, before)
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))

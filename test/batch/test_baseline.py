@@ -20,6 +20,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.options import bare
+from test.support.sessions import small_bag
 
 PLATE = Artifact(5, 0.01, 8)
 
@@ -98,3 +99,15 @@ def test_the_verb_compares_with_a_result(tmp_path, capsys):
     assert record["baseline"]["changed"] is False
     assert "differ from" in (out / "index.html").read_text()
     assert main(["batch", bag, "-o", str(out), "--baseline", str(tmp_path / "none.json")]) == 2
+
+
+def test_maps_that_are_not_compared_are_counted(tmp_path, capsys):
+    out = tmp_path / "out"
+    (tmp_path / "other").mkdir()
+    bag = small_bag(tmp_path / "other")
+    assert main(["solve", str(bag), "--quiet", "-o", str(tmp_path / "old.json")]) == 0
+    assert main(["batch", str(bag), "bags/hu_noise", "-o", str(out), "--workers", "1",
+                 "--baseline", str(tmp_path / "old.json")]) == 0
+    said = capsys.readouterr().out
+    assert "0 of 1 maps differ from" in said
+    assert "maps not compared, of another lattice or with too few nodes in common: 1" in said
