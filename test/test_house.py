@@ -9,7 +9,7 @@ import pytest
 
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-BASE = {"errors": set(), "memory": set(), "topics": set(), "units": set(), "start": set(),
+BASE = {"errors": set(), "topics": set(), "units": set(), "start": set(),
         "outputs": {"errors"}, "files": {"errors", "outputs"}}
 """Modules that any package may import (`start`: the edges), and what they import."""
 ROW = re.compile(r"\| `(\w+)` \|[^|]*\|([^|]*)\|")

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-ESTIMATION = ("options", "checks", "blas_threads", "lattice", "multifrontal", "normal",
+ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
               "datum", "terms", "observability", "joint", "law", "verdict", "comparison",
               "recheck", "api", "quality")
 """The parts of estimation/: each imports only those before it."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
-from selfcal_ros.estimation.lattice.splines import MapSpline
+from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.readings import Measurements, ViewReadings

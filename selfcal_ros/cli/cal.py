@@ -258,8 +258,8 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
     """Return the correction by the file of ``--onto``."""
     from selfcal_ros.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.aerotech.machine import plane_correction, setup_of
     from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.aerotech.verify import plane_correction, setup_of
 
     if args.onto is None:
         return None
@@ -285,7 +285,7 @@ def _verify(args: argparse.Namespace) -> int:
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
     say(args, residual_text(found.residuals), figures_of(found.residuals))
     if args.plot:
-        from selfcal_ros.aerotech.report import controller_figure
+        from selfcal_ros.aerotech.verify import controller_figure
         from selfcal_ros.reporting.figures.paper import save_picture
         save_picture(controller_figure(found), args.plot)
     if found.worse:

@@ -34,7 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check the cell, print the results; exit code 5 if a check fails."""
     from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
-    from selfcal_ros.collection.settings.plans import read_plan
+    from selfcal_ros.collection.settings.estimator import read_plan
     from selfcal_ros.files import read_bytes
 
     need_ros("")

@@ -75,7 +75,7 @@ def read_parts(names: Sequence[str]) -> list[Part]:
 
 
 def _text(result: CalibrationResult, found: dict[str, Any]) -> str:
-    from selfcal_ros.model.statistics import rms
+    from selfcal_ros.model.error_map import rms
 
     emap, noise = result.error_map, result.noise
     u = [rms(emap.u_gx), rms(emap.u_gy)]

@@ -66,7 +66,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sub-verb and return its exit code."""
-    from selfcal_ros.collection.settings.plans import read_plan
+    from selfcal_ros.collection.settings.estimator import read_plan
 
     plan = read_plan(args.plan)
     if plan.artifact_from:

@@ -28,12 +28,12 @@ def run(args: argparse.Namespace) -> int:
 
 def planned(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what views of a known plate will tell; for `selfcal plan check`."""
-    from selfcal_ros.collection.settings.plans import calibration_of
+    from selfcal_ros.collection.settings.estimator import calibration_of
     from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.estimation.recheck.known import known_plate
-    from selfcal_ros.estimation.recheck.planned import predict_recheck
+    from selfcal_ros.estimation.recheck.change import known_plate
+    from selfcal_ros.estimation.recheck.solve import predict_recheck
     from selfcal_ros.model.json_form import plain
-    from selfcal_ros.reporting.summary.format import counted
+    from selfcal_ros.reporting.summary.numbers import counted
 
     if args.plan_verb == "suggest":
         raise InputError(args.plan, "its plate is known: any view that reads all marks will do",

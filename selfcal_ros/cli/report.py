@@ -32,12 +32,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
-    from selfcal_ros.aerotech.report import table_chapter
+    from selfcal_ros.aerotech.verify import table_chapter
     from selfcal_ros.files import check_outputs, read_json
     from selfcal_ros.model.result import result_from_dict
     from selfcal_ros.reporting.chapters import ABOUT
     from selfcal_ros.reporting.report import check_name, write_report
-    from selfcal_ros.reporting.summary.format import can_print_symbols
+    from selfcal_ros.reporting.summary.numbers import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
 
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")

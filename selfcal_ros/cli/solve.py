@@ -182,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
-        from selfcal_ros.aerotech.report import table_chapter
+        from selfcal_ros.aerotech.verify import table_chapter
         from selfcal_ros.reporting.report import write_report
         write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
     if not args.quiet:
@@ -244,7 +244,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 
 def _since(result: Any) -> list[str]:
     """Return the change since the calibration of a known plate as it is printed."""
-    from selfcal_ros.reporting.words.rechecks import recheck_lines
+    from selfcal_ros.reporting.words.phrases import recheck_lines
 
     found = result.extra.get("recheck")
     return [] if found is None else ["", f"change since {found['of']}:", *(

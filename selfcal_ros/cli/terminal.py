@@ -34,7 +34,7 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
 
 def tell(text: str) -> None:
     """Print text; if stdout cannot encode µ, ° and the like, they are spelled out."""
-    from selfcal_ros.reporting.summary.format import can_print_symbols, to_ascii
+    from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
 
     print(text if can_print_symbols(sys.stdout) else to_ascii(text))
 
@@ -119,7 +119,7 @@ def _name_of(action: argparse.Action) -> str:
 def show(result: "CalibrationResult", bag: str, output: str | None, stream: TextIO) -> None:
     """Print the summary, compared with the truth if the bag folder has one."""
     from selfcal_ros.bagio.offline import read_truth
-    from selfcal_ros.reporting.summary.format import can_print_symbols
+    from selfcal_ros.reporting.summary.numbers import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
 
     print(summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
@@ -142,7 +142,7 @@ def exit_code(result: "CalibrationResult") -> int:
 def say_unless_qualified(result: "CalibrationResult", who: str) -> bool:
     """Print the verdict on stderr, and return whether a result is not qualified."""
     from selfcal_ros.model.verdict import Grade
-    from selfcal_ros.reporting.summary.format import can_print_symbols, printable, to_ascii
+    from selfcal_ros.reporting.summary.numbers import can_print_symbols, printable, to_ascii
 
     if result.verdict.grade is Grade.GOOD:
         return False

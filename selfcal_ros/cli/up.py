@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Start and supervise the nodes, show the screen, stop the nodes at the end."""
     from selfcal_ros.cli.monitor import watch
     from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
-    from selfcal_ros.collection.settings.plans import read_plan
+    from selfcal_ros.collection.settings.estimator import read_plan
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import read_bytes
 

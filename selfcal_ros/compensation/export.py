@@ -11,9 +11,8 @@ from scipy.sparse.linalg import spsolve
 from selfcal_ros import __version__
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.units import UM_PER_M
 

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.known import known_plate
+from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact

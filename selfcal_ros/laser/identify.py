@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.laser.adjust import adjust
 from selfcal_ros.laser.data import (
     Closure,
@@ -37,7 +37,7 @@ from selfcal_ros.laser.noise import (
     reading_covariance,
     reading_noise,
 )
-from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.error_map import rms
 
 
 def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from scipy.fft import dst
 from selfcal_ros.errors import InputError
 from selfcal_ros.laser.adjust import Adjusted
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.model.statistics import rms
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.units import MM_PER_M
 
 

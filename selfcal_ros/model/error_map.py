@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated error map of the stage, with datum and uncertainty."""
+"""The calibrated error map of the stage, with datum and uncertainty; NaN means unknown."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -7,6 +7,15 @@ from enum import StrEnum
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
+
+MANY_DOF = 1e9
+"""Finite substitute for infinite degrees of freedom in the tails of F and t."""
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square of the finite values; NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 class ThetaDatum(StrEnum):

@@ -13,8 +13,8 @@ from selfcal_ros.collection.sequencer import State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.sessions.compensating import plan_file_name
 from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.map_files import plan_file_name
 from selfcal_ros.sessions.sequencing import SequencingSession, load_plan
 
 

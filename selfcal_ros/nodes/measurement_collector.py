@@ -9,9 +9,9 @@ from typing import Any
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
+from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.managed import WhileConfigured, stop
 from selfcal_ros.nodes.names import MatchedInput, kept_names, offered

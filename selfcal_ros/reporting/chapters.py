@@ -13,14 +13,13 @@ from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
-from selfcal_ros.reporting.figures.camera import camera_errors
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
     component_maps,
     error_map,
 )
-from selfcal_ros.reporting.figures.places import plan_figure, rejected_map, views_in
+from selfcal_ros.reporting.figures.places import camera_errors, plan_figure, rejected_map, views_in
 from selfcal_ros.reporting.figures.residuals import (
     courses,
     distributions,
@@ -29,17 +28,17 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
-from selfcal_ros.reporting.summary.camera import camera_facts
-from selfcal_ros.reporting.summary.format import (
+from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     aligned_numbers,
+    camera_facts,
     fixed_column,
     printable,
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.reporting.words.findings import advice, unit_of, what_it_is
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import dof_text, excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 

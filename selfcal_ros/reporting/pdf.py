@@ -14,7 +14,7 @@ from selfcal_ros import __version__
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure
 from selfcal_ros.reporting.figures.paper import RC, drawable, put
-from selfcal_ros.reporting.summary.format import aligned, numeric_columns
+from selfcal_ros.reporting.summary.numbers import aligned, numeric_columns
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 WIDTH, HEIGHT, MARGIN = 595.0, 842.0, 48.0

@@ -16,8 +16,7 @@ from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters, heading
 from selfcal_ros.reporting.figures.svg import css as figures_css
 from selfcal_ros.reporting.figures.svg import inline_svg
-from selfcal_ros.reporting.summary.format import numeric_columns, printable
-from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.summary.numbers import numeric_columns, printable, truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 

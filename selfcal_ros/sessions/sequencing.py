@@ -12,8 +12,8 @@ import numpy as np
 from selfcal_ros.collection.expected import expected_marks
 from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SequencerSettings
-from selfcal_ros.collection.settings.plans import read_plan
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model

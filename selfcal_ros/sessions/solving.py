@@ -7,23 +7,22 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
+from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import Options, calibrate, pure_noise
 from selfcal_ros.files import write_json
-from selfcal_ros.memory import keep_freed_memory
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
 from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
-from selfcal_ros.reporting.summary.format import counted
-from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
+from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
-from selfcal_ros.sessions.map_files import is_qualified, read_result, result_file, run_file
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 
 ECHO_LENGTH = 128

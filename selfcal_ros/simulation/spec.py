@@ -11,9 +11,9 @@ import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.estimator import plan_of, read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
-from selfcal_ros.collection.settings.plans import plan_of, read_plan
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict

@@ -15,7 +15,7 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import convention_section
-from selfcal_ros.reporting.words.budget import line_text
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import dof_text, excluded_text, quantity_text
 from selfcal_ros.standards.details import UNITS
 from selfcal_ros.units import UM_PER_M

@@ -7,10 +7,9 @@ import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
 from selfcal_ros.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
-from selfcal_ros.aerotech.machine import setup_of, turned
 from selfcal_ros.aerotech.model import same_table
 from selfcal_ros.aerotech.read import parse_cal
-from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.aerotech.verify import setup_of, turned, verify_tables
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.export import fill_unknown, provenance

@@ -14,8 +14,7 @@ from selfcal_ros.aerotech.lines import (
     orthogonality,
     without_slope,
 )
-from selfcal_ros.aerotech.machine import plane_correction
-from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.aerotech.verify import plane_correction, verify_tables
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import reached

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.export import table_theta, table_xy
-from selfcal_ros.aerotech.report import controller_figure, table_chapter
-from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.aerotech.verify import controller_figure, table_chapter, verify_tables
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.reporting.figures.drawing import Discs, Label, Path
 from test.support.results import known_result

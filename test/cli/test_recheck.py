@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.plans import read_plan
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_json
 
 PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}

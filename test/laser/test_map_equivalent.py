@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.machine import setup_of
+from selfcal_ros.aerotech.verify import setup_of
 from selfcal_ros.cli.step_diagonal import correction_tables
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError

@@ -27,7 +27,7 @@ from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill, map_geometry
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.sessions.map_files import read_result
+from selfcal_ros.sessions.compensating import read_result
 from selfcal_ros.sessions.solving import Outcome, short
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros import __version__
-from selfcal_ros.aerotech.report import table_chapter
+from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict

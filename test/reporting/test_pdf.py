@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.aerotech.report import table_chapter
+from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.errors import InputError
 from selfcal_ros.reporting import pdf
 from selfcal_ros.reporting.chapters import Chapter, heading

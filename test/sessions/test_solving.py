@@ -24,8 +24,8 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import DEFAULT_TERMS
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, supersedes
+from selfcal_ros.sessions.compensating import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.map_files import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from test.support.plans import image_plan
 from test.support.ports import START_NS, Hands, message, settings_of

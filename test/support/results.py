@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.aerotech.report import table_chapter
+from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import (

@@ -17,9 +17,9 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Truth, random_truth

@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.comparison.maps import Significance, significance
 from selfcal_ros.estimation.joint.noise import coverage_factor
-from selfcal_ros.model.statistics import MANY_DOF
+from selfcal_ros.model.error_map import MANY_DOF
 
 INDEPENDENT = 1e-6
 """Length of a unit shape outside of those before it, below which it is not one of its own."""

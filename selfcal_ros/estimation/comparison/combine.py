@@ -9,7 +9,6 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.comparison.between import LEVEL, Deviation, Mean, Run, mean_of
 from selfcal_ros.estimation.comparison.covariance import (
     COVARIANCE,
@@ -20,13 +19,14 @@ from selfcal_ros.estimation.comparison.maps import require_same_lattice
 from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.verdict.uncertainty import (
     INTERPOLATION,
     TOLD,
     budget_lines,
     remaining_part,
 )
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
 from selfcal_ros.model.result import (
     COMBINED,
     ArtifactMap,
@@ -34,7 +34,6 @@ from selfcal_ros.model.result import (
     Noise,
     Observability,
 )
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import SHARED
 from selfcal_ros.model.verdict import (
     BudgetLine,

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
     theta_covariance,
@@ -21,9 +20,10 @@ from selfcal_ros.estimation.comparison.together import (
     plate_theta_covariance,
 )
 from selfcal_ros.estimation.datum.modes import datum_modes
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import MANY_DOF, rms
 from selfcal_ros.model.result import CalibrationResult, Noise
-from selfcal_ros.model.statistics import MANY_DOF, rms
 from selfcal_ros.units import MM_PER_M
 
 DIFFERENCE_LEVEL = 0.05

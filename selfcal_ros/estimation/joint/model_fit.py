@@ -16,8 +16,7 @@ import numpy as np
 
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
-from selfcal_ros.estimation.joint.fit import JointFit, angular_part, fit
-from selfcal_ros.estimation.joint.moving import Moving
+from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, noise_excess, sigma_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
@@ -28,7 +27,6 @@ from selfcal_ros.estimation.terms.equations import (
     residual_sums,
     score,
 )
-from selfcal_ros.estimation.terms.ground import without_noise
 from selfcal_ros.estimation.terms.projection import (
     ReducedColumns,
     project,
@@ -37,6 +35,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
+from selfcal_ros.estimation.terms.visits import without_noise
 from selfcal_ros.model.terms import OF_PLATE, SHARED, ModelTerm, TermName
 
 MAX_STEPS = 100

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc, stdtrit
 
-from selfcal_ros.model.statistics import MANY_DOF
+from selfcal_ros.model.error_map import MANY_DOF
 
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""

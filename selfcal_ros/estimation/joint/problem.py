@@ -18,9 +18,8 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.places import StagePlaces
-from selfcal_ros.estimation.terms.visits import between_visits
+from selfcal_ros.estimation.terms.visits import TermInputs, between_visits
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 

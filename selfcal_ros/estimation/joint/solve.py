@@ -15,7 +15,6 @@ from selfcal_ros.errors import (
     NotIdentifiableError,
     NotSettledError,
 )
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.datum.both import BothCovariance
 from selfcal_ros.estimation.datum.covariance import (
@@ -30,17 +29,17 @@ from selfcal_ros.estimation.datum.plate import (
     plate_covariance,
     plates_of_terms,
 )
-from selfcal_ros.estimation.joint.axes import (
+from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
+from selfcal_ros.estimation.joint.images import image_noise
+from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
+from selfcal_ros.estimation.joint.noise_effects import (
     MAX_SITES,
     added_variances,
     axis_contrast,
     axis_variances,
+    correlated_variances,
+    time_correlation,
 )
-from selfcal_ros.estimation.joint.correlated import correlated_variances, time_correlation
-from selfcal_ros.estimation.joint.fit import JointFit
-from selfcal_ros.estimation.joint.images import image_noise
-from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
-from selfcal_ros.estimation.joint.moving import noise_gain
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
 from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
 from selfcal_ros.estimation.joint.solved import (
@@ -52,18 +51,18 @@ from selfcal_ros.estimation.joint.solved import (
     saved_terms,
 )
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
-from selfcal_ros.estimation.terms.ground import ground_of
-from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.shapes import NO_LINES
-from selfcal_ros.estimation.terms.visits import check_visits
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.estimation.terms.sizes import require_terms_told
+from selfcal_ros.estimation.terms.visits import check_visits, ground_of
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import (
     ArtifactMap,
@@ -71,7 +70,6 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import OF_LINES, VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import LatticePose, Plan

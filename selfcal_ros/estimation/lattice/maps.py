@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.poses import AnyPose, MapPose, pose_of
+from selfcal_ros.estimation.lattice.readings import AnyPose, MapPose, pose_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import ViewReadings

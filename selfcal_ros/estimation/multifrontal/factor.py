@@ -8,8 +8,17 @@ All this is real except for the cut, which is solved last; only the real part of
 enters the diagonal.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from threading import RLock
+from typing import Any
+
+import numpy  # noqa: F401  (its library must be loaded before it can be found)
 import numpy as np
+import scipy.linalg  # noqa: F401  (so must scipy's own)
 from scipy.linalg import blas, lapack
+from threadpoolctl import ThreadpoolController
 
 from selfcal_ros.estimation.multifrontal.dissection import RealSymmetricForm, dissect
 
@@ -236,3 +245,33 @@ def _inverse(lower: np.ndarray) -> np.ndarray:
     lower[half:, :half] = blas.dtrmm(-1.0, last, below, lower=1, overwrite_b=1)
     lower[:half, :half], lower[half:, half:] = first, last
     return lower
+
+
+_lock = RLock()
+_limits: list[Any] = []
+_depth = 0
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run the block with one BLAS thread.
+
+    The number is restored when the outermost block of any thread of this process has ended.
+    """
+    global _depth
+    with _lock:
+        _depth += 1
+        if _depth == 1:
+            _limits.append(_controller().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _lock:
+            _depth -= 1
+            if _depth == 0:
+                _limits.pop().restore_original_limits()

@@ -15,9 +15,8 @@ from scipy.sparse import csr_matrix, diags, identity
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
-from selfcal_ros.estimation.lattice.placed import PlacedViews
-from selfcal_ros.estimation.lattice.poses import MapPose
-from selfcal_ros.estimation.lattice.splines import MapSpline
+from selfcal_ros.estimation.lattice.placed import MapSpline, PlacedViews
+from selfcal_ros.estimation.lattice.readings import MapPose
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 

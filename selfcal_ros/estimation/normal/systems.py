@@ -10,8 +10,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.poses import AnyPose, MapPose, in_field, pose_of
-from selfcal_ros.estimation.lattice.readings import AngularData, GridData
+from selfcal_ros.estimation.lattice.readings import (
+    AngularData,
+    AnyPose,
+    GridData,
+    MapPose,
+    in_field,
+    pose_of,
+)
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem

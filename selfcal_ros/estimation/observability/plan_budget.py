@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.plan_check import (
     PROXY_SIZE,

@@ -9,9 +9,8 @@ from selfcal_ros.estimation.datum.angular import Conditions, conditions_for
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.statistics import rms
 
 MAX_SITES = 151 * 151
 """Largest field whose uncertainty map is predicted in full."""

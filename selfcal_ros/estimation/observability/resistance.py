@@ -18,12 +18,11 @@ import numpy as np
 from scipy.special import fdtri
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.plan_check import PROXY_SIZE, smaller, unit_repeats
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction
 from selfcal_ros.estimation.terms.equations import TermEquations
-from selfcal_ros.estimation.terms.identifiable import require_terms_told
 from selfcal_ros.estimation.terms.planned import (
     SEED,
     Assumed,
@@ -32,8 +31,9 @@ from selfcal_ros.estimation.terms.planned import (
     rows_of,
     with_terms,
 )
+from selfcal_ros.estimation.terms.sizes import require_terms_told
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, ModelTerm, TermName
 from selfcal_ros.model.view import Plan
 

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 from math import comb, inf
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.blas_threads import one_thread
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.any_pose import (
     Pose,

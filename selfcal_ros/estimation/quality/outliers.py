@@ -18,9 +18,9 @@ from scipy.special import chdtri, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import fit_joint
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_views, residuals_of
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view

@@ -21,13 +21,12 @@ from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.ground import TermInputs, ground_of
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
 from selfcal_ros.estimation.terms.shapes import shapes_in_full
-from selfcal_ros.estimation.terms.visits import ViewVisits, time_ranges
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
+from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.statistics import MANY_DOF
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
 
 LEVEL = 1e-3

@@ -17,17 +17,12 @@ from selfcal_ros.errors import (
     NotSettledError,
 )
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.lattice.maps import (
-    maps_of,
-    rotation_excess,
-    turned_marks,
-    turned_plate,
-)
-from selfcal_ros.estimation.lattice.poses import pose_of
+from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess, turned_marks, turned_plate
+from selfcal_ros.estimation.lattice.readings import pose_of
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     smaller,
@@ -44,10 +39,9 @@ from selfcal_ros.estimation.quality.prediction import (
     prediction_limit,
 )
 from selfcal_ros.estimation.quality.residuals import ROUNDING
-from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
 

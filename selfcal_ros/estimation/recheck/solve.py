@@ -8,7 +8,6 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.blas_threads import one_thread
 from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.joint.noise import (
     F_LEVEL,
@@ -24,17 +23,20 @@ from selfcal_ros.estimation.joint.solved import noise_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import system_for
+from selfcal_ros.estimation.observability.prediction import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import (
+    KnownPlate,
     NewLines,
     NewMap,
     joint_dof,
     line_change,
     map_change,
+    on_plate,
     record,
 )
-from selfcal_ros.estimation.recheck.known import KnownPlate, on_plate
 from selfcal_ros.estimation.recheck.views import (
     Gain,
     PlateReadings,
@@ -44,16 +46,16 @@ from selfcal_ros.estimation.recheck.views import (
     stacked,
 )
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.ground import ground_of, without_noise
 from selfcal_ros.estimation.terms.places import places_of
+from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, rms
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability, ViewResult
-from selfcal_ros.model.statistics import MANY_DOF, rms
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
+from selfcal_ros.model.view import Plan, View
 
 KEY = "recheck"
 """Key of what a recheck found among the extras of a result."""
@@ -328,3 +330,55 @@ def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
                          source, details)
     yield from (line for line in budget_lines(result)
                 if (line.quantity, line.component) == ("xy", INTERPOLATION))
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRecheck:
+    """Predicted uncertainties, in units of the noise of one averaged reading.
+
+    Attributes
+    ----------
+    map : Prediction
+        Of the new map.
+    change : float
+        Of the change of a coordinate, rms over the nodes.
+    """
+
+    map: Prediction
+    change: float
+
+
+@one_thread()
+def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
+    """Return what views of a known plate will tell, with the noise of its calibration.
+
+    Raises
+    ------
+    NotIdentifiableError, InputError
+        As `selfcal_ros.estimation.recheck.solve.recheck`.
+    """
+    readings = Measurements(plan.plan_id, plan.artifact, tuple(
+        _planned(view, plan) for view in plan.views))
+    found: Rechecked = recheck_of(readings, Options(assumed=(), misalignment_model="linear"), plate)
+    noise = plate.result.noise
+    root = np.sqrt(min(view.repeats for view in plan.views))
+    unit = noise.sigma_xy / root
+    emap = found.error_map(plate)
+    u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
+    return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
+                          rms(map_change(found.new, plate).u) / unit)
+
+
+def _planned(view: View, plan: Plan) -> ViewReadings:
+    """Return the readings of a view, all 0."""
+    out, artifact = ViewReadings(view), plan.artifact
+    if view.grid:
+        read = view.pose.in_field(artifact)
+        nothing = np.zeros(int(read.sum()))
+        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
+                      count=np.full(len(nothing), view.repeats))
+    if view.angular and artifact.angular_count:
+        lines = np.arange(artifact.angular_count)
+        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
+                      count_theta=np.full(len(lines), view.repeats))
+    return out

@@ -21,9 +21,8 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
-from selfcal_ros.estimation.terms.visits import ViewVisits, squares_within
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, squares_within
 from selfcal_ros.model.terms import OF_LINES, UNITS, VISIT_TERMS, ModelTerm, TermName
 
 AtVisits = list[list[np.ndarray | None]]

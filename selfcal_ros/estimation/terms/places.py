@@ -15,9 +15,9 @@ import numpy as np
 from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
 from selfcal_ros.estimation.lattice.maps import AnyViews, LatticeViews, maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
-from selfcal_ros.estimation.terms.ground import TermInputs
+from selfcal_ros.estimation.terms.visits import TermInputs
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.statistics import rms
 
 AT_SITES = 1e-5
 """Distance from the sites, in pitches, at which the stage stands at them: even where its error is a

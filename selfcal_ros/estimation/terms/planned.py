@@ -21,14 +21,13 @@ from selfcal_ros.estimation.terms.columns import (
     term_columns,
 )
 from selfcal_ros.estimation.terms.equations import TermEquations
-from selfcal_ros.estimation.terms.ground import TermInputs, placings_of
 from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
     project,
     reduce_columns,
     reduce_lines,
 )
-from selfcal_ros.estimation.terms.visits import ViewVisits
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, placings_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm

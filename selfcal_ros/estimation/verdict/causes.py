@@ -14,8 +14,8 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.noise import pooled
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.normal.equations import angular_residuals
-from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.sizes import SizeTest
+from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.explanations import FLOOR_M, LEVEL, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
 from selfcal_ros.estimation.verdict.uncertainty import Effect

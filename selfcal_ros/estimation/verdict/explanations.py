@@ -21,7 +21,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squar
 from selfcal_ros.estimation.joint.problem import noise_excess
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
-from selfcal_ros.estimation.terms.ground import TermInputs, without_noise
+from selfcal_ros.estimation.terms.visits import TermInputs, without_noise
 from selfcal_ros.estimation.verdict.off_sites import (
     READING,
     SLIP,

@@ -22,11 +22,9 @@ from selfcal_ros.estimation.terms.columns import (
     WithinMarks,
     columns_from,
 )
-from selfcal_ros.estimation.terms.ground import TermInputs
 from selfcal_ros.estimation.terms.shapes import shapes_of
-from selfcal_ros.estimation.terms.visits import ViewVisits
-from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.model.statistics import rms
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
+from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.verdict import Cause
 
 READING = "reading"

@@ -42,8 +42,8 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     effect_of_field,
     enlargements,
 )
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 

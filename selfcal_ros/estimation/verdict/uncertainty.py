@@ -20,9 +20,9 @@ from selfcal_ros.estimation.joint.solved import (
     rounded,
     variance_of_terms,
 )
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult, Noise
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
 
 TOLD = 0.5

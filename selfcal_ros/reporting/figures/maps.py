@@ -15,8 +15,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
-from selfcal_ros.reporting.summary.format import UNKNOWN, significant
-from selfcal_ros.reporting.summary.numbers import truth_arrays
+from selfcal_ros.reporting.summary.numbers import UNKNOWN, significant, truth_arrays
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.reporting.figures import drawing as draw
-from selfcal_ros.reporting.summary.format import significant
+from selfcal_ros.reporting.summary.numbers import significant
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 WIDTH = 480.0

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import CalibrationResult, ViewResult
-from selfcal_ros.model.statistics import rms
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, span_of
-from selfcal_ros.reporting.summary.format import significant
+from selfcal_ros.reporting.summary.numbers import significant
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 

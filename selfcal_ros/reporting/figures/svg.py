@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from html import escape
 
 from selfcal_ros.reporting.figures import drawing as draw
-from selfcal_ros.reporting.summary.format import printable
+from selfcal_ros.reporting.summary.numbers import printable
 
 FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'
 FIGURE_CSS = (f"svg.figure {{ display: block; width: 100%; height: auto; font-family: {FONT}; }}\n"

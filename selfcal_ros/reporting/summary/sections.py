@@ -13,26 +13,24 @@ from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.reporting.summary.camera import camera_facts
-from selfcal_ros.reporting.summary.format import (
+from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
+    MapFigures,
     aligned,
     aligned_numbers,
     arcsec,
+    camera_facts,
     counted,
     decimals_for,
     fixed,
     fixed_column,
+    map_figures,
     numeric_columns,
     printable,
     significant,
     to_ascii,
-    um,
-)
-from selfcal_ros.reporting.summary.numbers import (
-    MapFigures,
-    map_figures,
     truth_figures,
+    um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
 from selfcal_ros.reporting.words.tables import excluded_text

@@ -13,8 +13,8 @@ from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
-from selfcal_ros.reporting.words import rechecks
-from selfcal_ros.reporting.words.budget import line_text
+from selfcal_ros.reporting.words import phrases
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
     MM_PER_M,
@@ -176,7 +176,7 @@ SENTENCES: dict[str, Words] = {
     "axes_not_met": lambda f, of: (
         "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
         f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"),
-    "changed": rechecks.changed_text, "plate_misfit": rechecks.misfit_text,
+    "changed": phrases.changed_text, "plate_misfit": phrases.misfit_text,
     "prediction_failed": lambda f, of: (
         f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
         f"beyond the limit of {of['limit']:.2f}"),
@@ -343,7 +343,7 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
         verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
     if RECHECK in result.extra and verdict.qualified:
-        verdict = replace(verdict, sentence=rechecks.recheck_sentence(result.extra[RECHECK]))
+        verdict = replace(verdict, sentence=phrases.recheck_sentence(result.extra[RECHECK]))
     return replace(result, verdict=verdict, findings=findings,
                    warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))

@@ -14,8 +14,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 

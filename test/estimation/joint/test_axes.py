@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint import axes, solve
-from selfcal_ros.estimation.joint.axes import axis_contrast
+from selfcal_ros.estimation.joint import noise_effects, solve
+from selfcal_ros.estimation.joint.noise_effects import axis_contrast
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -77,4 +77,4 @@ def test_above_a_size_both_axes_have_one_uncertainty(monkeypatch):
     monkeypatch.setattr(solve, "MAX_SITES", 24)
     common = solve_joint(readings, options).result.error_map
     assert np.nanmean(told.u_gx) > np.nanmean(common.u_gx) > np.nanmean(told.u_gy)
-    assert axes.MAX_SITES >= 21**2
+    assert noise_effects.MAX_SITES >= 21**2

@@ -6,7 +6,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
-from selfcal_ros.estimation.joint.correlated import time_correlation
+from selfcal_ros.estimation.joint.noise_effects import time_correlation
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
-from selfcal_ros.estimation.joint import moving
+from selfcal_ros.estimation.joint import fit as fitting
 from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
@@ -94,7 +94,7 @@ def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(m
     made = [measured(plan_of("0,90,tx", Artifact(7, 0.01)), seed, t_m=2e-3, **FOLLOWS)
             for seed in range(20)]
     held = ratio()
-    monkeypatch.setattr(moving, "FAR", np.inf)
+    monkeypatch.setattr(fitting, "FAR", np.inf)
     assert held == pytest.approx(1, abs=0.1)
     assert ratio() > 1.1 * held
 

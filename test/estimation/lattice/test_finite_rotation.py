@@ -4,11 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.lattice.maps import (
-    rotation_excess,
-    turned_marks,
-    turned_plate,
-)
+from selfcal_ros.estimation.lattice.maps import rotation_excess, turned_marks, turned_plate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap

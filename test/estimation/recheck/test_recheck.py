@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
-from selfcal_ros.estimation.recheck.known import known_plate
+from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, subset

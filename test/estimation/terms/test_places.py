@@ -8,8 +8,8 @@ import pytest
 from scipy.interpolate import RectBivariateSpline
 
 from selfcal_ros.estimation.lattice.readings import grid_data
-from selfcal_ros.estimation.terms.ground import ground_of
 from selfcal_ros.estimation.terms.places import _filled, places_of
+from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View

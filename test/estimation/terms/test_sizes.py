@@ -13,8 +13,8 @@ from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.estimation.terms.test_terms import plan_of, settings

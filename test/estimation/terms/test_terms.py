@@ -10,7 +10,7 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.ground import ground_of
+from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms

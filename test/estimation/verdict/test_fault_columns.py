@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.lattice.readings import grid_data
-from selfcal_ros.estimation.terms.ground import ground_of
+from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.estimation.verdict.off_sites import slip_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.cell import CellSettings

@@ -15,8 +15,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
-from selfcal_ros.reporting.words.budget import line_text
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import budget_text, quantity_text
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of

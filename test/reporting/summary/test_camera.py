@@ -10,8 +10,8 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
-from selfcal_ros.reporting.figures.camera import camera_errors
-from selfcal_ros.reporting.summary.camera import camera_facts, cells_of
+from selfcal_ros.reporting.figures.places import camera_errors
+from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings

@@ -17,14 +17,16 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, ModelResult, TermEstimate, TermResult, Verdict
-from selfcal_ros.reporting.summary.format import (
+from selfcal_ros.reporting.summary.numbers import (
     aligned,
     can_print_symbols,
     fixed_column,
+    map_figures,
     significant,
+    summary_numbers,
     to_ascii,
+    truth_figures,
 )
-from selfcal_ros.reporting.summary.numbers import map_figures, summary_numbers, truth_figures
 from selfcal_ros.reporting.summary.sections import (
     place_text,
     pose_text,

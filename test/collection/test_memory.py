@@ -9,7 +9,7 @@ import pytest
 PAGES_OF = """
 import resource
 import numpy as np
-from selfcal_ros.memory import keep_freed_memory
+from selfcal_ros.collection.collector import keep_freed_memory
 
 def pages():
     for _ in range(3):
