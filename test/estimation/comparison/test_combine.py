@@ -262,6 +262,12 @@ def test_the_run_that_differs_is_named():
     assert sum(line.effect_rms**2 for line in parts) == pytest.approx(total)
 
 
+def test_runs_agree_where_p_is_above_the_level():
+    rows = combine([part(name, one) for name, one in zip("abc", (A, B, C), strict=True)]
+                   ).result.extra["combined"]["runs"]
+    assert all(row["agrees"] and 0.05 < row["p"] <= 1 for row in rows)
+
+
 def test_sites_that_a_run_does_not_know_are_unknown():
     hole = B.error_map.gx.copy()
     hole[1, 2] = np.nan

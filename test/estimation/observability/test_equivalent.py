@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans that turn or mirror into each other have one key, and one uncertainty."""
 
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -48,6 +49,15 @@ def test_what_changes_the_plan_has_another_key_and_score(name):
     assert equivalent_key(SQUARE, views) != equivalent_key(SQUARE, views_of(BASE))
     found, base = (score_plan(Plan("p", SQUARE, v)) for v in (views, views_of(BASE)))
     assert abs(found.rms_xy - base.rms_xy) > 1e-6
+
+
+def test_shifts_are_compared_in_pitches_whatever_the_pitch():
+    """With marks 10 um apart a shift of a pitch is far below the rounding in metres."""
+    small = Artifact(5, 1e-5)
+    plans = [[replace(view, translation_m=tuple(1e-3 * part for part in view.translation_m))
+              for view in views_of(poses)] for poses in (BASE, OTHER["one shift back"])]
+    assert equivalent_key(small, plans[0]) == equivalent_key(SQUARE, views_of(BASE))
+    assert equivalent_key(small, plans[1]) != equivalent_key(small, plans[0])
 
 
 def test_a_long_field_only_turns_by_a_half():

@@ -7,6 +7,7 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.laser.simulation.config import simulation_from_dict, truth_of
+from selfcal_ros.laser.simulation.measure import SetUp
 
 CONFIG = Path(__file__).parents[3] / "config" / "step_diagonal"
 
@@ -37,6 +38,12 @@ def test_units_and_places_of_every_key():
     noise = simulation.measurement.noise
     assert (noise.distance_m, noise.reading_m, noise.linear_m) == pytest.approx((1e-9, 2e-9, 3e-9))
     assert noise.repeats == 4
+
+
+def test_a_setup_without_keys_is_aligned_exactly():
+    simulation = simulation_from_dict({"setups": {"pp": {}}, "machine": {
+        "steps_mm": [10, 5], "ex_x": [0.0]}}, "s")
+    assert simulation.measurement.setups == {"pp": SetUp((0.0,), (0.0,))}
 
 
 def test_the_seed_draws_the_machine():
