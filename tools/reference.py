@@ -85,7 +85,8 @@ RESULT = {
              "size_used (if the readings contradict the size), source (declared, default, "
              "readings)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without; "
-                 "with `reference_at` `certified`: its numbers and temperatures",
+                 "with `reference_at` `certified`: its numbers and temperatures; "
+                 "of the kind marks `marks`: their (m, n)",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
                   "visit_order of each view",
     "dof": "degrees of freedom of the map's uncertainty at its nodes, Welch-Satterthwaite: xy, "

@@ -48,7 +48,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="ROS parameter file, the same as for the nodes")
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
                         "scale: artifact, stage_x or stage_y, its relative error and the standard "
-                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7")
+                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
+                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U")
     parser.add_argument("--certificate", metavar="TEXT",
                         help="certificate of the reference: number and issuer")
     parser.add_argument("--reference-at", metavar="T:U_T:ALPHA:U_ALPHA[:T0]",
@@ -122,12 +123,16 @@ def _reference(text: str | None) -> dict[str, Any]:
     """Return the solver parameters in KIND:ERROR:U."""
     if text is None:
         return {}
+    kind, _, rest = text.partition(":")
+    if kind == "marks":
+        return {"reference_kind": kind, "reference_marks": rest}
     try:
-        kind, error, u = text.split(":")
+        error, u = rest.split(":")
         return {"reference_kind": kind, "reference_error": float(error), "reference_u": float(u)}
     except ValueError as error:
         raise InputError("--reference", f"{text!r} is not KIND:ERROR:U",
-                         "write e.g. artifact:1.2e-6:3e-7") from error
+                         "write e.g. artifact:1.2e-6:3e-7, or marks:-5,0:5,0:0.1000002:5e-9"
+                         ) from error
 
 
 def run(args: argparse.Namespace) -> int:

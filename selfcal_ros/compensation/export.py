@@ -12,6 +12,7 @@ from selfcal_ros import __version__
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, rms
+from selfcal_ros.model.json_form import reference_name
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.units import UM_PER_M
@@ -124,5 +125,5 @@ def _reference_lines(result: CalibrationResult) -> list[str]:
     if not reference:
         return ["reference length: none, the scale is a convention"]
     certificate = reference.get("certificate") or "no certificate named"
-    return [f"reference length: {reference['kind']}, relative error {reference['relative_error']:g}"
-            f", u {reference['u_relative']:g} ({certificate})"]
+    return [f"reference length: {reference_name(reference)}, relative error "
+            f"{reference['relative_error']:g}, u {reference['u_relative']:g} ({certificate})"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
@@ -22,6 +23,12 @@ class ReferenceKind(StrEnum):
     ARTIFACT = "artifact"
     STAGE_X = "stage_x"
     STAGE_Y = "stage_y"
+    MARKS = "marks"
+
+    @property
+    def of_plate(self) -> bool:
+        """Whether the plate is what was measured, not an axis of the stage."""
+        return self in (ReferenceKind.ARTIFACT, ReferenceKind.MARKS)
 
 
 @dataclass(frozen=True)
@@ -31,9 +38,11 @@ class ReferenceLength:
     Attributes
     ----------
     kind : ReferenceKind
-        ``artifact``: a certified plate; ``stage_x``, ``stage_y``: a laser-measured axis.
+        ``artifact``: a certified plate; ``marks``: the distance of two of its marks; ``stage_x``,
+        ``stage_y``: a laser-measured axis.
     relative_error : float
         Plate: (true - nominal) / nominal length, the least-squares scale of A over the plate.
+        Marks: (true - nominal) / nominal distance.
         Stage axis: (indicated - true) / nominal length, the least-squares slope of Gx on x
         (of Gy on y) over the field.
     u_relative : float
@@ -43,11 +52,14 @@ class ReferenceLength:
     certified : dict, optional
         If the numbers above were moved to the temperature of the measurement (`at_temperature`):
         those of the certificate, and what moved them.
+    marks : pair of (int, int), optional
+        (m, n) of the two marks.
 
     Raises
     ------
     InputError
-        If a number is not finite, not small, or the uncertainty is negative.
+        If a number is not finite, not small, or the uncertainty is negative; if the marks are
+        not two.
     """
 
     kind: ReferenceKind
@@ -55,9 +67,50 @@ class ReferenceLength:
     u_relative: float = 0.0
     certificate: str = ""
     certified: dict[str, float] | None = None
+    marks: tuple[tuple[int, int], ...] | None = None
+
+    @classmethod
+    def between(cls, text: str, artifact: Artifact, certificate: str = "") -> "ReferenceLength":
+        """Return the distance of two marks of a plate as a reference.
+
+        Parameters
+        ----------
+        text : str
+            M,N:M,N:LENGTH:U: the marks, their distance and its standard uncertainty, m.
+        artifact : Artifact
+            The plate.
+        certificate : str
+            Number and issuer.
+
+        Raises
+        ------
+        InputError
+            If the text is something else, or the marks are not two of the plate.
+        """
+        where, example = "reference length", "write e.g. -5,0:5,0:0.1000002:5e-9 (m)"
+        try:
+            first, second, *numbers = text.split(":")
+            marks = tuple((int(m), int(n)) for m, n in (first.split(","), second.split(",")))
+            length, u = map(float, numbers)
+        except ValueError as error:
+            raise InputError(where, f"'{text}' is not M,N:M,N:LENGTH:U", example) from error
+        for mark in marks:
+            if any(abs(at) > half for at, half in zip(mark, artifact.half, strict=True)):
+                raise InputError(where, f"the plate has no mark {mark}", "its marks go from "
+                                 f"(-{artifact.half[0]}, -{artifact.half[1]}) to {artifact.half}")
+        nominal = artifact.grid_pitch_m * math.dist(*marks)
+        if nominal == 0:
+            raise InputError(where, f"'{text}' names one mark twice", "name two marks")
+        return cls(ReferenceKind.MARKS, (length - nominal) / nominal, u / nominal, certificate,
+                   marks=marks)
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be relative errors."""
+        """Refuse values that cannot be relative errors, and marks that are not two."""
+        if self.marks is not None:  # lists in a file
+            object.__setattr__(self, "marks", tuple(tuple(mark) for mark in self.marks))
+        if (self.kind == ReferenceKind.MARKS) != (len(set(self.marks or ())) == 2):
+            raise InputError("reference length", f"kind '{self.kind}' with the marks {self.marks}",
+                             "two different marks belong to the kind 'marks', and to no other")
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
         if not abs(self.relative_error) < 0.1:
             raise InputError("reference length", f"{self.relative_error} is not a relative error",
@@ -94,7 +147,7 @@ class ReferenceLength:
             raise InputError("reference length", f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
                              "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)")
         warmer = known["temperature_c"] - known["certified_at_c"]
-        sign = 1 if self.kind is ReferenceKind.ARTIFACT else -1  # a longer scale indicates less
+        sign = 1 if self.kind.of_plate else -1  # a longer scale indicates less
         return replace(
             self, relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
             u_relative=math.hypot(self.u_relative, known["expansion_per_k"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal_ros.model import verdict as verdicts
 
-REFERENCES = ("artifact", "stage_x", "stage_y")
+REFERENCES = ("artifact", "stage_x", "stage_y", "marks")
 """Kinds of a reference length."""
 
 _hints = cache(get_type_hints)
@@ -150,4 +150,14 @@ def reference_from_dict(raw: Any) -> dict[str, Any] | None:
     read(str, raw.get("certificate") or "")
     for value in read(dict, raw.get("certified") or {}).values():
         read(float, value)
+    marks = [read(tuple[int, ...], mark) for mark in read(list, raw.get("marks") or [])]
+    if (raw["kind"] == "marks") != (len(set(marks)) == 2 == len(marks[0]) == len(marks[1])):
+        raise ValueError(f"reference: the marks {marks} do not fit the kind {raw['kind']!r}")
     return raw
+
+
+def reference_name(reference: dict[str, Any]) -> str:
+    """Return what was certified: the kind of a reference length, or its marks."""
+    if reference["kind"] != "marks":
+        return str(reference["kind"])
+    return "distance of the marks {} and {}".format(*map(tuple, reference["marks"]))

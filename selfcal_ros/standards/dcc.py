@@ -13,6 +13,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
+from selfcal_ros.model.json_form import reference_name
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import convention_section
 from selfcal_ros.reporting.words.phrases import line_text
@@ -182,8 +183,8 @@ def scale_texts(result: CalibrationResult) -> list[str]:
     if not reference:
         return ["The scale of the map is a convention, relative to the encoders: no reference "
                 "length was used. Form, straightness and squareness do not depend on a reference."]
-    texts = [f"The scale is set by a reference length ({reference['kind']}): relative error "
-             f"{reference['relative_error']:.4g}, standard uncertainty "
+    texts = [f"The scale is set by a reference length ({reference_name(reference)}): relative "
+             f"error {reference['relative_error']:.4g}, standard uncertainty "
              f"{reference['u_relative']:.3g}; certificate: "
              f"{reference.get('certificate') or 'none'}."]
     if known := reference.get("certified"):

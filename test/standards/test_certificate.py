@@ -33,6 +33,7 @@ IN = {"dcc": DCC, "si": SI}
 SCHEMA = os.environ.get("SELFCAL_DCC_SCHEMA", "")
 """dcc.xsd of version 3.3.0, with the schemas beside it that it imports; lxml must be installed."""
 CERTIFIED = ReferenceLength("artifact", 1e-6, 2e-7, "PTB 1")
+OF_MARKS = ReferenceLength.between("-2,0:2,0:0.04000004:8e-9", Artifact(5, 0.01), "PTB 1")
 
 
 def solved(reference=None, *, lines=8):
@@ -166,7 +167,8 @@ def test_only_a_certified_reference_at_its_temperature_is_traceable():
     full = CERTIFIED.at_temperature("21:.1:5e-7:5e-8")
     for reference, traceable in ((None, False), (CERTIFIED, False), (full, True),
                                  (replace(full, certificate=""), False),
-                                 (replace(full, u_relative=0.0), False)):
+                                 (replace(full, u_relative=0.0), False), (OF_MARKS, False),
+                                 (OF_MARKS.at_temperature("21:.1:5e-7:5e-8"), True)):
         result = solved(reference)
         assert is_traceable(result) is traceable
         said = statement(written(result), "Metrological traceability")
@@ -175,6 +177,8 @@ def test_only_a_certified_reference_at_its_temperature_is_traceable():
         assert ("PTB 1" in text) is bool(reference and reference.certificate)
         assert ("used at 21 °C" in text) is bool(reference and reference.certified)
         assert ("Not traceable" in text) is bool(reference and not traceable)
+        assert ("(distance of the marks (-2, 0) and (2, 0))" in text) is bool(
+            reference and reference.marks)
 
 
 def test_a_result_that_is_not_qualified_needs_the_option():

@@ -43,5 +43,6 @@ def map_covariance(measurements: Measurements, options: Options) -> MapCovarianc
     problem, found = model.problem, model.found
     scale = (scale_datum(problem.system, options.reference, problem.half_width_m)
              if options.reference else None)
-    field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma, model.spread)
+    field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma,
+                            model.spread(options.reference))
     return MapCovariance(measurements.artifact, field, found.xy.sigma, measurements.sense)

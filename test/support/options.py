@@ -3,7 +3,7 @@
 
 from typing import Any
 
-from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.options import Options, ReferenceLength
 
 
 def bare(**how: Any) -> Options:
@@ -12,3 +12,12 @@ def bare(**how: Any) -> Options:
 
 
 BARE = bare()
+
+
+MARKS = ((-1, 0), (1, 1))
+"""Marks of a reference length between two of them."""
+
+
+def reference_length(kind, error=0.0, u=0.0):
+    """Return a reference length of any kind; that of marks between `MARKS`."""
+    return ReferenceLength(kind, error, u, marks=MARKS if kind == "marks" else None)

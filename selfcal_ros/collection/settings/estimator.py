@@ -71,12 +71,7 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
         For invalid terms, or if there is no result of the plate's calibration.
     """
     plate_from = plate_from or (measurements.artifact_from if measurements is not None else "")
-    kind = settings.reference_kind
-    reference = None if kind == "none" else ReferenceLength(
-        ReferenceKind(kind), settings.reference_error, settings.reference_u,
-        settings.reference_certificate)
-    if reference and settings.reference_at:
-        reference = reference.at_temperature(settings.reference_at)
+    reference = _reference(settings, measurements)
     terms, origin = _terms(settings.model_terms, measurements)
     assumed = _assumed(settings)
     return Options(method=settings.method, datum_theta=ThetaDatum(settings.theta_datum),
@@ -87,6 +82,23 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    drift_degree=settings.drift_degree, plate_from=plate_from,
                    plate=calibration_of(plate_from) if plate_from else None,
                    magnification_limit=settings.magnification_limit)
+
+
+def _reference(settings: SolverSettings,
+               measurements: Measurements | None) -> ReferenceLength | None:
+    """Return the reference length; None if there is none, or that of marks of no plate."""
+    kind, marks = settings.reference_kind, settings.reference_marks
+    if bool(marks) != (kind == ReferenceKind.MARKS):
+        raise InputError("reference_marks", f"'{marks}' does not fit reference_kind '{kind}'",
+                         "give M,N:M,N:LENGTH:U with the kind 'marks', and only then")
+    if kind == "none" or (marks and measurements is None):
+        return None
+    reference = ReferenceLength.between(
+        marks, measurements.artifact, settings.reference_certificate
+    ) if marks and measurements else ReferenceLength(
+        ReferenceKind(kind), settings.reference_error, settings.reference_u,
+        settings.reference_certificate)
+    return reference.at_temperature(settings.reference_at) if settings.reference_at else reference
 
 
 def _terms(given: list[str],

@@ -134,10 +134,10 @@ class SolverSettings(ManagedSettings):
     reference_error: float = declared(
         0.0, "relative error of that length: artifact (true - nominal) / nominal, stage axis "
         "(indicated - true) / nominal", "m/m", -0.09, 0.09)
-    reference_u: float = declared(
-        0.0, "standard uncertainty of reference_error (k=1)", "m/m", 0.0, 0.09)
-    reference_certificate: str = declared(
-        "", "certificate of that length: number and issuer")
+    reference_u: float = declared(0.0, "standard uncertainty of that (k=1)", "m/m", 0.0, 0.09)
+    reference_marks: str = declared(
+        "", "kind marks: (m, n) of two marks, their distance and its u, M,N:M,N:LENGTH:U (m)")
+    reference_certificate: str = declared("", "certificate of that length: number and issuer")
     reference_at: str = declared(
         "", "temperatures that move it to the measurement, T:U_T:ALPHA:U_ALPHA[:T0] "
         "(docs/certificate.md); empty = measured where it is used")

@@ -6,6 +6,8 @@ stage and misalignments make of them: the noise of that mean is independent of b
 covariance of all functionals of G and A follows from M, Y and P (method eq. 4.14).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 
@@ -13,13 +15,13 @@ from selfcal_ros.estimation.datum.covariance import (
     NO_NOISE_M,
     TermSpread,
     scale_of,
+    scale_of_plate,
     slope_in_datum,
 )
-from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 
 BLOCK = 1024
 """Number of marks computed at once."""
@@ -114,9 +116,9 @@ class BothCovariance:
     def _scale(self, reference: ReferenceLength) -> tuple[np.ndarray, np.ndarray]:
         """Return the scale that a reference sets, as functionals (sites,), (marks,) of the maps."""
         system, views = self.system, self.system.grid.views
-        if reference.kind is ReferenceKind.ARTIFACT:
-            dual = Gauge(views.z, system.known_marks, scale=True).dual(3)
-            return np.zeros(system.grid.n_sites, dtype=complex), dual.reshape(-1)
+        if reference.kind.of_plate:
+            return (np.zeros(system.grid.n_sites, dtype=complex),
+                    scale_of_plate(system, reference).reshape(-1))
         return -slope_in_datum(system, reference.kind), np.zeros(views.z.size, dtype=complex)
 
     def _without_datum(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,8 +171,8 @@ class BothCovariance:
         plate = plate + parts[3] * system.grid.views.z
         plate = system.plate_gauge.remove(plate, system.plate_gauge.parts(plate))
         if self.reference is not None:
-            kind = ReferenceLength(self.reference.kind, 0.0)
-            grown = scale_of(system, kind, field=field, plate=plate, half_width_m=self.length)
+            free = replace(self.reference, relative_error=0.0)
+            grown = scale_of(system, free, field=field, plate=plate, half_width_m=self.length)
             field = field + grown * system.grid.views.z_sites
             plate = plate - grown * system.grid.views.z
         return (np.where(system.known_sites, field, 0.0),

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -59,17 +60,43 @@ def scale_datum(system: NormalEquations, reference: ReferenceLength,
         Unit of the system's positions, m.
     """
     u = reference.u_relative * half_width_m
-    if reference.kind is not ReferenceKind.ARTIFACT:
+    if not reference.kind.of_plate:
         return ScaleDatum(-slope_in_datum(system, reference.kind),
                           np.zeros(3 * system.grid.n_views), 0.0, u)
-    return scale_by_plate(system, Gauge(system.grid.views.z, system.known_marks,
-                                        scale=True).dual(3), u)
+    return scale_by_plate(system, scale_of_plate(system, reference), u)
+
+
+def scale_of_plate(system: NormalEquations, reference: ReferenceLength | None) -> np.ndarray:
+    """Return the row of the plate's map that is its scale, complex (nx, ny).
+
+    That of the distance of two marks if the reference is one, else the least-squares scale.
+
+    Raises
+    ------
+    InputError
+        If one of the two marks was not measured.
+    """
+    z, known = system.grid.views.z, system.known_marks
+    if reference is None or reference.marks is None:
+        return Gauge(z, known, scale=True).dual(3)
+    first, second = ((m + z.shape[0] // 2, n + z.shape[1] // 2) for m, n in reference.marks)
+    for mark, at in zip(reference.marks, (first, second), strict=True):
+        if not known[at]:
+            raise InputError("reference length", f"the mark {mark} was not measured",
+                             "measure it, or take another reference")
+    apart, row = z[second] - z[first], np.zeros(z.shape, dtype=complex)
+    row[second], row[first] = (sign * apart / abs(apart) ** 2 for sign in (1, -1))
+    return row
 
 
 def slope_in_datum(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
     """Return the row of the slope along an axis of a map in its datum, complex (sites,)."""
+    return without_datum(system, _slope(system.grid.views.z_sites, system.known_sites, kind))
+
+
+def without_datum(system: NormalEquations, rows: np.ndarray) -> np.ndarray:
+    """Return functionals (sites,) or (sites, k) of a map in its datum as those of a free map."""
     basis = system.gauge.orthonormal
-    rows = _slope(system.grid.views.z_sites, system.known_sites, kind)
     return rows - basis @ np.real(basis.conj().T @ rows)
 
 
@@ -93,11 +120,10 @@ def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.n
              plate: np.ndarray, half_width_m: float) -> float:
     """Return c for a map and a plate in their datum, m at the unit of position."""
     value = reference.relative_error * half_width_m
-    if reference.kind is not ReferenceKind.ARTIFACT:
+    if not reference.kind.of_plate:
         rows = _slope(system.grid.views.z_sites, system.known_sites, reference.kind)
         return value - float(np.real(rows.conj() @ field.ravel()))
-    dual = Gauge(system.grid.views.z, system.known_marks, scale=True).dual(3)
-    return float(np.real(np.vdot(dual, plate))) - value
+    return float(np.real(np.vdot(scale_of_plate(system, reference), plate))) - value
 
 
 def _slope(z: np.ndarray, known: np.ndarray, kind: ReferenceKind) -> np.ndarray:
@@ -185,8 +211,7 @@ class FieldCovariance:
 
     def project(self, rows: np.ndarray) -> np.ndarray:
         """Return functionals (sites, k) as acting on a map that is not in its datum."""
-        basis = self.system.gauge.orthonormal
-        return rows - basis @ np.real(basis.conj().T @ rows)
+        return without_datum(self.system, rows)
 
     def _functionals(self, flat: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return functionals (sites, k) of G in its datum as those of the free unknowns.

@@ -13,12 +13,14 @@ from selfcal_ros.estimation.datum.covariance import (
     ScaleDatum,
     TermSpread,
     scale_by_plate,
+    scale_of_plate,
     slope_in_datum,
+    without_datum,
 )
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Marks, system_of
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.view import LatticePose
 
 BLOCK = 512
@@ -90,6 +92,8 @@ def plate_covariance(cover: FieldCovariance, reference: ReferenceLength | None, 
         if not _of_plate(reference):
             grown = grown + np.real(other.gauge.dual(3).reshape(-1).conj() @ flat)
         rest = grown - np.real(scale.rows.conj() @ flat) - scale.parameters @ moved
+        if _of_plate(reference):  # the marks set their own scale
+            rest = np.zeros(len(grown))
         terms = TermSpread(flat, moved, of_stage.covariance, rest, of_stage.turned)
     return FieldCovariance(other, move @ cover.inverse[:n, :n] @ move.T, scale, sigma_m, terms)
 
@@ -104,7 +108,7 @@ def plates_of_terms(cover: FieldCovariance, columns: np.ndarray) -> np.ndarray:
 
 
 def _of_plate(reference: ReferenceLength | None) -> bool:
-    return reference is not None and reference.kind is ReferenceKind.ARTIFACT
+    return reference is not None and reference.kind.of_plate
 
 
 def _scale_row(system: NormalEquations, reference: ReferenceLength | None) -> np.ndarray:
@@ -121,9 +125,11 @@ def _scale(system: NormalEquations, other: NormalEquations, reference: Reference
            half_width_m: float) -> ScaleDatum:
     """Return the scale of the plate's map: that of stage and plate together, or the reference's."""
     u_m = 0.0 if reference is None else reference.u_relative * half_width_m
-    if _of_plate(reference):
-        return ScaleDatum(np.zeros(other.grid.n_sites, dtype=complex),
-                          np.zeros(3 * other.grid.n_views), 0.0, u_m, of_plate=True)
+    if reference is not None and reference.kind.of_plate:
+        row = np.zeros(other.grid.n_sites, dtype=complex)
+        if reference.marks is not None:  # else the datum has it
+            row = -without_datum(other, scale_of_plate(system, reference).reshape(-1))
+        return ScaleDatum(row, np.zeros(3 * other.grid.n_views), 0.0, u_m, of_plate=True)
     return scale_by_plate(other, _scale_row(system, reference), u_m)
 
 

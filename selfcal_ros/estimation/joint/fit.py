@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.covariance import scale_of
+from selfcal_ros.estimation.datum.covariance import scale_of, scale_of_plate
 from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
@@ -99,6 +99,10 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     if problem.reference is not None:
         grown = scale_of(system, problem.reference, field=field, plate=plate,
                          half_width_m=length)
+        if problem.reference.marks is not None:  # across, a distance changes by the square
+            across = np.vdot(scale_of_plate(system, problem.reference), plate).imag
+            true = length * (1 + problem.reference.relative_error)
+            grown += true - np.sqrt(max(true**2 - across**2, 0.0))
         field, plate = field + grown * grid.views.z_sites, plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
     field, plate = grid.free_parts_small(field, plate)

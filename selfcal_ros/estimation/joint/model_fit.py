@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.errors import NotSettledError
-from selfcal_ros.estimation.datum.covariance import TermSpread
+from selfcal_ros.estimation.datum.covariance import TermSpread, scale_of_plate
 from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, noise_excess, sigma_of
-from selfcal_ros.estimation.lattice.connectivity import Gauge
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     Sums,
@@ -112,14 +112,13 @@ class ModelFit:
             return np.zeros((0, 0))
         return self.equations.inverse(self.found.xy.sigma)
 
-    @property
-    def spread(self) -> TermSpread | None:
-        """How the uncertainty of the terms reaches the map; None without terms."""
+    def spread(self, reference: ReferenceLength | None) -> TermSpread | None:
+        """Return how the terms' uncertainty reaches a map in the scale of `reference`, or None."""
         if self.equations is None:
             return None
         now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
         system, shapes = self.problem.system, now.columns.shapes
-        dual = Gauge(system.grid.views.z, system.known_marks, scale=True).dual(3)
+        dual = scale_of_plate(system, reference)
         of_marks = shapes.against(shapes.sums(system.grid.relative_weight * dual))
         return TermSpread(now.projected.fields, now.projected.parameters,
                           now.inverse(self.found.xy.sigma), of_marks, now.projected.turned)

@@ -271,7 +271,8 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
     tested = problem.conditions.datum is ThetaDatum.XY_AXES  # that the stage keeps its axes
     if problem.direct and (wanted or tested):
         scale = (scale_datum(system, options.reference, length) if options.reference else None)
-        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma, model.spread)
+        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma,
+                                model.spread(options.reference))
         if wanted:
             variance = np.stack(cover.diagonal())
             if system.grid.n_sites <= MAX_SITES:
@@ -349,7 +350,7 @@ def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> Artifact
     u_theta = np.full(system.angular.n_lines, np.nan)
     if problem.direct and options.uncertainty is not False:
         cover = FieldCovariance(system, found.inverse, scale_datum(system, alone, length),
-                                sigma, model.spread)
+                                sigma, model.spread(alone))
         u = float(np.sqrt(cover.scale_variance)) * sigma / length
     if math.isfinite(u):
         columns, lines = np.zeros((0, *problem.grid.y.shape), dtype=complex), NO_LINES

@@ -82,7 +82,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     result = replace(solved.result, reference=None if reference is None else {
         "kind": str(reference.kind), "relative_error": reference.relative_error,
         "u_relative": reference.u_relative, "certificate": reference.certificate,
-        **({"certified": reference.certified} if reference.certified else {})})
+        **({"certified": reference.certified} if reference.certified else {}),
+        **({"marks": [*map(list, reference.marks)]} if reference.marks else {})})
     result = with_coverage(enlarged(result, searched.effects))
     bounded = searched.bounded and (own or not searched.causes) and not _unexplained_noise(solved)
     grade = (Grade.GOOD if not (failed or noises or searched.causes) else

@@ -26,7 +26,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.map_covariance import map_covariance
-from test.support.options import BARE, bare
+from test.support.options import BARE, bare, reference_length
 from test.support.recalibrations import responses, sizes_of
 
 PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
@@ -49,7 +49,7 @@ def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("reference", [
     None, ReferenceLength("stage_x", 1e-6, 0.0), ReferenceLength("stage_y", 1e-6, 2e-6),
-    ReferenceLength("artifact", 1e-6, 2e-6)])
+    ReferenceLength("artifact", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)])
 def test_covariance_of_a_saved_map(sense, reference):
     readings = measured(PLAN, 1, sense=sense)
     options = bare(reference=reference)
@@ -67,7 +67,8 @@ def test_covariance_of_a_saved_map(sense, reference):
 
 
 @pytest.mark.parametrize("sense", Sense)
-@pytest.mark.parametrize("reference", [None, ReferenceLength("stage_x", 1e-6, 2e-6)])
+@pytest.mark.parametrize("reference", [
+    None, ReferenceLength("stage_x", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)])
 def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
     readings = measured(TURNED, 1, sense=sense, missing=0.1)
     options = bare(reference=reference, terms=(

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.lattice_plans import plan_of
-from test.support.options import bare
+from test.support.options import bare, reference_length
 
 STEP_M = 1e-7
 
@@ -42,7 +42,7 @@ def plate_of(measurements, options):
 @pytest.mark.parametrize("kind", [None, *ReferenceKind])
 def test_each_reading_adds_what_it_does_to_the_plate(kind, sense):
     whole, u_scale = readings(sense), 0.0 if kind is None else 2e-6
-    options = linear(reference=None if kind is None else ReferenceLength(kind, 0.0, u_scale))
+    options = linear(reference=None if kind is None else reference_length(kind, 0.0, u_scale))
     result, centre = calibrate(whole, options), plate_of(whole, options)
     power = (u_scale * np.stack([whole.artifact.x_m, whole.artifact.y_m])) ** 2
     for index, view in enumerate(whole.views):

@@ -6,9 +6,10 @@ import pytest
 
 from selfcal_ros.estimation.datum.covariance import scale_datum, scale_of
 from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of
+from test.support.options import reference_length
 
 HALF_M = 0.03
 PLAN = plan_of("0,90,tx,270-2tx+ty", Artifact(7, 0.01, 0, 5))
@@ -27,12 +28,12 @@ def in_datum(system, field, parameters):
 def test_the_rows_give_the_change_of_the_scale(kind):
     """Of a random free-network solution whose readings are all zero."""
     system, rng = planned_system(PLAN.artifact, PLAN.views), np.random.default_rng(4)
-    reference = ReferenceLength(kind, 3e-6, 5e-7)
+    reference = reference_length(kind, 3e-6, 5e-7)
     datum = scale_datum(system, reference, HALF_M)
     assert datum.u_m == pytest.approx(5e-7 * HALF_M)
     none = np.zeros(system.grid.views.shape, dtype=complex)
     start = scale_of(system, reference, field=none, plate=none, half_width_m=HALF_M)
-    assert start == pytest.approx((-1 if kind is ReferenceKind.ARTIFACT else 1) * 3e-6 * HALF_M)
+    assert start == pytest.approx((-1 if kind.of_plate else 1) * 3e-6 * HALF_M)
     for _ in range(3):
         raw = rng.normal(size=none.shape) + 1j * rng.normal(size=none.shape)
         raw, parameters = raw * 1e-7, rng.normal(size=system.size) * 1e-7
@@ -47,10 +48,11 @@ def test_a_longer_plate_and_an_axis_that_indicates_too_much_turn_the_scale_the_r
     """A plate that is e longer than nominal has A = +e z; an axis that indicates e too much, G."""
     system = planned_system(PLAN.artifact, PLAN.views)
     z, none = system.grid.views.z, np.zeros(system.grid.views.shape, dtype=complex)
-    plate = ReferenceLength(ReferenceKind.ARTIFACT, 2e-6)
-    assert scale_of(system, plate, field=none, plate=2e-6 * HALF_M * z,
-                    half_width_m=HALF_M) == pytest.approx(0.0, abs=1e-18)
-    axis = ReferenceLength(ReferenceKind.STAGE_Y, 2e-6)
+    for kind in (ReferenceKind.ARTIFACT, ReferenceKind.MARKS):
+        plate = reference_length(kind, 2e-6)
+        assert scale_of(system, plate, field=none, plate=2e-6 * HALF_M * z,
+                        half_width_m=HALF_M) == pytest.approx(0.0, abs=1e-18)
+    axis = reference_length(ReferenceKind.STAGE_Y, 2e-6)
     only_y = 1j * 2e-6 * HALF_M * z.imag
     assert scale_of(system, axis, field=only_y, plate=none,
                     half_width_m=HALF_M) == pytest.approx(0.0, abs=1e-18)

@@ -18,7 +18,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 from test.support.map_covariance import map_covariance
-from test.support.options import BARE, bare
+from test.support.options import BARE, MARKS, bare, reference_length
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
 
 TABLE = {  # method, section 11: rms of u(G) / sigma of a reading for N = 5, 11, 21
@@ -146,6 +146,13 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
         good = np.isfinite(reached)
         value = (reached[good] @ grown[good]) / (grown[good] @ grown[good])
         reference = ReferenceLength(kind, value - scale, 2e-6)
+    elif kind is ReferenceKind.MARKS:
+        plate = free.artifact_map
+        one, two = ((m + 2, n + 2) for m, n in MARKS)
+        apart = grown[:, *two] - grown[:, *one]
+        now = apart + [a[two] - a[one] for a in (plate.ax, plate.ay)]
+        value = np.hypot(*now) / np.hypot(*apart) - 1
+        reference = reference_length(kind, value - scale, 2e-6)
     else:
         axis = 0 if kind is ReferenceKind.STAGE_X else 1
         error = free.error_map.gx if axis == 0 else free.error_map.gy

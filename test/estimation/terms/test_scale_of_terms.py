@@ -15,7 +15,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.map_covariance import map_covariance
-from test.support.options import bare
+from test.support.options import bare, reference_length
 
 PITCH, SIZE = 0.01, 1e-6
 ARTIFACT = Artifact(5, PITCH, 0)
@@ -24,13 +24,17 @@ VIEWS = (("0", 0, (0, 0)), ("90", 1, (0, 0)), ("+x", 0, (1, 0)), ("-x", 0, (-1, 
 PLATE = ReferenceLength("artifact", 0.0)
 
 
-def measured(seed, grown, *, sense=Sense.MICROSCOPE_MOVES, sigma=1e-10):
+def measured(seed, grown, *, sense=Sense.MICROSCOPE_MOVES, sigma=1e-10, marks=None):
     """Return truth and readings of a plate that is larger by `grown` in each view."""
     views = tuple(View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, False, 2)
                   for name, q, (a, b) in VIEWS)
     plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(views), rng, Spread(rotation="finite"))
-    radial = np.sum(truth.a * np.stack([X, Y])) / np.sum(X**2 + Y**2)
+    radial = scale_in(truth.a)
+    if marks is not None:
+        one, two = (np.s_[:, m + 2, n + 2] for m, n in marks)
+        apart = np.stack([X, Y])[two] - np.stack([X, Y])[one]
+        radial = (truth.a[two] - truth.a[one]) @ apart / (apart @ apart)
     truth.a[:] -= radial * np.stack([X, Y])  # it was certified without an error of its length
     truth = replace(truth, plate_scale=np.asarray(grown))
     return truth, simulate_measurements(truth, plan, rng, sigma_m=sigma, sense=sense)
@@ -54,11 +58,12 @@ def u_of_scale(readings, chosen):
     return float(np.sqrt(map_covariance(readings, chosen).of(rows)[0, 0]))
 
 
+@pytest.mark.parametrize("reference", [PLATE, reference_length("marks")])
 @pytest.mark.parametrize("sense", Sense)
-def test_growth_that_all_views_share_is_in_the_uncertainty_of_the_scale(sense):
+def test_growth_that_all_views_share_is_in_the_uncertainty_of_the_scale(sense, reference):
     """No reading tells the mean growth: known to SIZE in each view, to SIZE / sqrt(n) in all."""
-    chosen = options(f"plate_scale:{SIZE}")
-    truth, readings = measured(1, 4 * [SIZE], sense=sense)
+    chosen = options(f"plate_scale:{SIZE}", reference)
+    truth, readings = measured(1, 4 * [SIZE], sense=sense, marks=reference.marks)
     result = calibrate(readings, chosen)
     assert result.verdict.qualified
     assert abs(scale_error(result, truth)) == pytest.approx(SIZE, rel=0.02)

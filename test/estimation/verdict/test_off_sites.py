@@ -18,7 +18,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
-from test.support.options import BARE, bare
+from test.support.options import BARE, bare, reference_length
 
 N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
 HALF_M = (N - 1) // 2 * PITCH_M
@@ -175,7 +175,8 @@ def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
 @pytest.mark.parametrize("options", [
     bare(uncertainty=False), bare(misalignment_model="linear"),
     bare(terms=parse_terms(["plate_scale:1e-7"], "")),
-    bare(reference=ReferenceLength("artifact", 0.0, 1e-7))])
+    bare(reference=ReferenceLength("artifact", 0.0, 1e-7)),
+    bare(reference=reference_length("marks", 0.0, 1e-7))])
 def test_it_is_found_whatever_else_is_asked_for(options):
     found = calibrate(readings(follow=True, rough_m=1e-7), options).verdict
     assert found.causes[0].name == "off_sites"
