@@ -15,8 +15,9 @@ from selfcal_ros.estimation.comparison.combine import Combination, Part, combine
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.parallel import check_workers, outcomes
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.simulation.machine import random_truth
 
 ARTIFACT = Artifact(7, 0.01, 12)
 SIGMA_M, SIGMA_RAD = 20e-9, 20e-6

@@ -243,8 +243,9 @@ def example() -> dict[str, Any]:
 
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.model.artifact import Artifact
+    from selfcal_ros.papers.readings import hu_plan, simulate_measurements
     from selfcal_ros.reporting.words.findings import worded
-    from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+    from selfcal_ros.simulation.machine import random_truth
 
     rng = np.random.default_rng(1)
     plan = hu_plan(Artifact(5, 0.01, 8), 2)

@@ -36,7 +36,8 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from selfcal_ros.papers.readings import hu_plan, simulate_measurements
+from selfcal_ros.simulation.machine import random_truth
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "test" / "bench"))

@@ -17,13 +17,14 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
-from selfcal_ros.simulation import truth as truths
+from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 ARTIFACT = Artifact(11, 0.01, 24)
 """Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg."""
-AS_PUBLISHED = truths.Spread(encoder="xy_axes", rotation="linear")
+AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class HuRun:
 class HuReproduction:
     """The whole simulation: the truth, the noise-free error, both tables."""
 
-    truth: truths.Truth
+    truth: Truth
     noise_free_um: float
     noise_free_deg: float
     runs: tuple[HuRun, ...]
@@ -100,8 +101,8 @@ def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
     The draws are solved by `workers` processes, with the same results for any number of them.
     """
     rng = np.random.default_rng(seed)
-    truth = truths.random_truth(ARTIFACT, 4, rng, AS_PUBLISHED)
-    exact = _law_errors(truth, [truths.simulate_measurements(truth, truths.hu_plan(ARTIFACT), rng)])
+    truth = random_truth(ARTIFACT, 4, rng, AS_PUBLISHED)
+    exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
     runs = []
     for number, table in enumerate(TABLES):
         spread = partial(mapped_in_parts, workers=workers,
@@ -115,10 +116,10 @@ def _later(progress: Progress, number: int, done: int, total: int) -> None:
     progress(done + number * total, len(TABLES) * total)
 
 
-def _run(truth: truths.Truth, table: Published, rng: np.random.Generator, n_draws: int,
+def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int,
          spread: Callable) -> HuRun:
-    plan = truths.hu_plan(ARTIFACT)
-    draws = [truths.simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * M_PER_UM,
+    plan = hu_plan(ARTIFACT)
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * M_PER_UM,
                                           sigma_theta_rad=np.deg2rad(table.sigma_deg))
              for _ in range(n_draws)]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
@@ -126,7 +127,7 @@ def _run(truth: truths.Truth, table: Published, rng: np.random.Generator, n_draw
     return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws, spread), bound)
 
 
-def _law_errors(truth: truths.Truth, draws: list[Measurements]) -> Errors:
+def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     law = law_for(ARTIFACT, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
     each = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
     found = law.solve(HuReadings(*(np.concatenate([getattr(one, name) for one in each], axis=-1)
@@ -135,7 +136,7 @@ def _law_errors(truth: truths.Truth, draws: list[Measurements]) -> Errors:
     return Errors(xy * UM_PER_M, np.rad2deg(found.g_theta.T - truth.g_theta))
 
 
-def _joint_errors(truth: truths.Truth, draws: list[Measurements], spread: Callable) -> Errors:
+def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> Errors:
     maps = spread(_joint_maps, draws)
     xy = np.array([[m.gx - truth.g[0], m.gy - truth.g[1]] for m in maps])
     theta = np.array([m.g_theta - truth.g_theta for m in maps])

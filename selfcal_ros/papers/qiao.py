@@ -18,14 +18,15 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.papers.readings import grid_deviation, simulate_measurements
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
-from selfcal_ros.simulation import truth as truths
+from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import UM_PER_M
 
 SIZES = (3, 5, 7, 9, 11)
 ARTIFACT = Artifact(11, 0.01)
-SPREAD = truths.Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6,
-                       encoder="xy_axes", rotation="linear")
+SPREAD = Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6,
+                encoder="xy_axes", rotation="linear")
 SIGMA_M = 0.1e-6
 PUBLISHED_RMS_UM = (0.0563, 0.0572)
 PUBLISHED_MEAN_UM = 0.05
@@ -133,12 +134,12 @@ def reproduce_qiao(n_draws: int, seed: int, *, workers: int = 1,
     seen = [[plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES]
             for row in ROWS]
     rng = np.random.default_rng(seed)
-    truth = truths.random_truth(ARTIFACT, 3, rng, SPREAD)
+    truth = random_truth(ARTIFACT, 3, rng, SPREAD)
     first, second = (_program(truth, views) for views in PROGRAMS)
     plan = plan_of(PROGRAMS[0])
-    draws = [truths.simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M)
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M)
              for _ in range(n_draws)]
-    exact = truths.simulate_measurements(truth, plan, rng)
+    exact = simulate_measurements(truth, plan, rng)
     draws += [_with_uniform_noise(exact, rng) for _ in range(n_draws)]
     errors = mapped_in_parts(partial(_all_errors_um, truth), draws, workers=workers,
                              progress=progress)
@@ -154,11 +155,11 @@ def _rms(errors: list[np.ndarray]) -> np.ndarray:
     return np.sqrt(np.mean(np.array(errors) ** 2, axis=(2, 3)))
 
 
-def _all_errors_um(truth: truths.Truth, draws: list[Measurements]) -> list[np.ndarray]:
+def _all_errors_um(truth: Truth, draws: list[Measurements]) -> list[np.ndarray]:
     return [_errors_um(truth, readings) for readings in draws]
 
 
-def _errors_um(truth: truths.Truth, readings: Measurements) -> np.ndarray:
+def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
     options = Options(misalignment_model="linear", uncertainty=False)
     found = calibrate(readings, options).error_map
     return (np.stack([found.gx, found.gy]) - truth.g) * UM_PER_M
@@ -174,19 +175,19 @@ def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Mea
                         tuple(shaken(view) for view in readings.views), readings.sense)
 
 
-def _program(truth: truths.Truth, views: tuple[str, ...]) -> Program:
+def _program(truth: Truth, views: tuple[str, ...]) -> Program:
     """Solve without noise: by the estimator, or by the generalised inverse if it refuses."""
     plan = plan_of(views)
     seen = plan_observability(plan)
     if seen.identifiable:
-        readings = truths.simulate_measurements(truth, plan, np.random.default_rng(0))
+        readings = simulate_measurements(truth, plan, np.random.default_rng(0))
         found = truth.g * UM_PER_M + _errors_um(truth, readings)
     else:
         found = _minimum_norm(truth, plan) * UM_PER_M
     return Program(views, truth.g * UM_PER_M, found, seen.deficiency)
 
 
-def _minimum_norm(truth: truths.Truth, plan: Plan) -> np.ndarray:
+def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
     """Return G (2, N, N) of the generalised inverse of Qiao's eqs. 1 and 5, m.
 
     Columns are the readings of unit truths, lengths counted in pitches so that rotations weigh
@@ -209,17 +210,17 @@ def _minimum_norm(truth: truths.Truth, plan: Plan) -> np.ndarray:
     return found[:2 * sites].reshape(2, *artifact.shape)
 
 
-def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> truths.Truth:
+def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
     sites, pitch = artifact.m.size, artifact.grid_pitch_m
     shape = (2, *artifact.shape)
     tail = vector[4 * sites:].reshape(n_views, 3)
-    return truths.Truth(artifact, vector[:2 * sites].reshape(shape),
+    return Truth(artifact, vector[:2 * sites].reshape(shape),
                         vector[2 * sites:4 * sites].reshape(shape), np.zeros(0), np.zeros(0),
                         tail[:, 0] / pitch, tail[:, 1:], linear=True)
 
 
-def _observe(truth: truths.Truth, plan: Plan) -> np.ndarray:
-    parts = [truths.grid_deviation(truth, i, view).ravel() for i, view in enumerate(plan.views)]
+def _observe(truth: Truth, plan: Plan) -> np.ndarray:
+    parts = [grid_deviation(truth, i, view).ravel() for i, view in enumerate(plan.views)]
     values = np.concatenate(parts)
     return values[np.isfinite(values)]
 

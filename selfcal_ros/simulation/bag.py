@@ -19,10 +19,10 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.json_form import plain
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.exposing import Exposure
+from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.physics import stage_error
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.simulation.spec import Simulation
-from selfcal_ros.simulation.truth import Truth
 
 QOS = {
     topics.ENCODER_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),

@@ -19,9 +19,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map, result_of
 from test.support.slow_cal import slow_2d
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01, 24)
 OBLONG = Artifact(7, 0.01, 24, 5)

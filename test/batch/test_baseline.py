@@ -18,9 +18,9 @@ from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.options import bare
 from test.support.sessions import small_bag
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 PLATE = Artifact(5, 0.01, 8)
 

@@ -21,7 +21,7 @@ import numpy as np
 from ingest_bags import Recording, recording, write_bag
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import Truth, hu_plan, random_truth, simulate_measurements
+from test.support.truth import Truth, hu_plan, random_truth, simulate_measurements
 
 PITCH_M = 0.01
 ENCODER_NS = 1_000_000

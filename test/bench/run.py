@@ -47,7 +47,7 @@ def readings(size: int, missing: float = 0.0):
     import numpy as np
 
     from selfcal_ros.model.artifact import Artifact
-    from selfcal_ros.simulation.truth import (
+    from test.support.truth import (
         Spread,
         hu_plan,
         random_truth,

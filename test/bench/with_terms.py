@@ -18,7 +18,7 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.truth import simulate_measurements
 
 TERMS = "microscope,drift,plate_scale,plate_shape:30e-9,approach"
 VIEWS = (("as it is", 0, 0.0, 0.0), ("90", 1, 0.0, 0.0), ("+x", 0, 0.01, 0.0),

@@ -13,8 +13,8 @@ from selfcal_ros.files import read_json, write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
 from selfcal_ros.reporting.figures import maps, paper
 from selfcal_ros.reporting.figures.drawing import Drawing
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.summary.sections import summary_text
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ROOT = Path(__file__).parents[2]
 

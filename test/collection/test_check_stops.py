@@ -13,9 +13,9 @@ from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import START_NS, Scene, collect, gathered
 from test.support.plans import plan_of
+from test.support.truth import random_truth
 
 OFFSET = 20e-6
 NOISE = 20e-9

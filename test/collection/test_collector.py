@@ -19,8 +19,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.spec import Faults, apply_faults
-from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table
+from test.support.truth import angular_deviation, grid_deviation
 
 MS = 1_000_000
 ROUNDING_M = 1e-16

@@ -11,9 +11,9 @@ from selfcal_ros.collection.inputs import REMEDY, Reason
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import START_NS, gathered, scene
 from test.support.plans import placed_plan
+from test.support.truth import random_truth
 
 S = 1_000_000_000
 

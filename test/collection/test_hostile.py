@@ -10,8 +10,8 @@ import pytest
 from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.collection.marks.repeats import MIN_PAIRS, reduce_repeats
 from selfcal_ros.errors import InputError
-from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table
+from test.support.truth import angular_deviation, grid_deviation
 
 MS = 1_000_000
 

@@ -18,9 +18,9 @@ from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, MotionEstimate,
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.simulation.truth import angular_deviation, random_truth
 from test.support.collecting import START_NS, collect
 from test.support.plans import plan_of
+from test.support.truth import angular_deviation, random_truth
 
 RULES = IdentityRules(5e-4, 0.5, 0.035)
 

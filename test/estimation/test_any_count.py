@@ -16,8 +16,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.options import BARE, bare
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 SIGMA_RAD = 2e-5
 

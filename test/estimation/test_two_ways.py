@@ -15,10 +15,10 @@ from selfcal_ros.estimation.quality.residuals import noisy_views, residuals_of
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings, subset
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.two_ways import (
     maps_of,
     mirrored,

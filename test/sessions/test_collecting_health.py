@@ -20,12 +20,12 @@ from selfcal_ros.sessions.journal_keeper import take_up
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.simulation.truth import random_truth
 from selfcal_ros.topics import INPUT_TOPICS
 from test.support.collecting import detection_table, encoder_block
 from test.support.misplaced import laid
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import events_of, small_plan
+from test.support.truth import random_truth
 
 
 def as_message(fields: dict) -> object:

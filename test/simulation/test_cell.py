@@ -10,9 +10,9 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kin
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings, plan_events, view_events
-from selfcal_ros.simulation.truth import angular_deviation, grid_deviation, random_truth
 from test.support.collecting import START_NS, collect, scene
 from test.support.plans import plan_of
+from test.support.truth import angular_deviation, grid_deviation, random_truth
 
 PLAN = plan_of("0, 90, tx", 5, count=8, line=True, repeats=2)
 

@@ -6,8 +6,8 @@ import pytest
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.simulation.spec import Faults, apply_faults
-from selfcal_ros.simulation.truth import angular_deviation, grid_deviation
 from test.support.collecting import collect, scene
+from test.support.truth import angular_deviation, grid_deviation
 
 NOISE = {"sigma_xy_m": 2e-8, "sigma_theta_rad": 2e-6}
 

@@ -17,7 +17,7 @@ from selfcal_ros.model.visit_order import visit_sequence
 from selfcal_ros.simulation.cell import CellSettings, flicker_noise, grid_exposures, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import encoder_error, stage_error
-from selfcal_ros.simulation.truth import angular_deviation, grid_deviation, simulate_measurements
+from test.support.truth import angular_deviation, grid_deviation, simulate_measurements
 
 PLATE = Artifact(3, 0.1, 4)
 SENSES = pytest.mark.parametrize("sense", list(Sense))

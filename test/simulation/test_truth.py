@@ -13,7 +13,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import _stage
 from selfcal_ros.simulation.physics import encoder_error, stage_error
-from selfcal_ros.simulation.truth import (
+from test.support.plans import plan_of
+from test.support.truth import (
     Spread,
     angular_deviation,
     grid_deviation,
@@ -21,7 +22,6 @@ from selfcal_ros.simulation.truth import (
     random_truth,
     simulate_measurements,
 )
-from test.support.plans import plan_of
 
 PLATES = [Artifact(11, 0.01, 24), Artifact(21, 0.005, 72), Artifact(5, 0.01, 8, 9)]
 

@@ -10,9 +10,9 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.collecting import START_NS, collect
 from test.support.plans import placed_plan, plan_of
+from test.support.truth import simulate_measurements
 
 EVERYTHING = Spread(rotation="finite", encoder="independent", microscope_scale=5e-3,
                     microscope_rotation_rad=2e-3, microscope_shear=1e-3, backlash_x_m=4e-8,

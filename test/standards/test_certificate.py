@@ -22,10 +22,10 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from selfcal_ros.standards.chapter import certificate_chapter
 from selfcal_ros.standards.dcc import DCC, SI, certificate, is_traceable
 from selfcal_ros.standards.details import details_from_dict
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 DETAILS = Path(__file__).parents[2] / "config/certificates/details.yaml"
 GIVEN = yaml.safe_load(DETAILS.read_text())

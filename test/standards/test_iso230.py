@@ -19,7 +19,6 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from selfcal_ros.standards.iso230 import (
     Scatter,
     axis_figures,
@@ -31,6 +30,7 @@ from selfcal_ros.standards.iso230 import (
 from test.support.maps import random_map, result_of
 from test.support.options import bare
 from test.support.pages import ROOT
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01)
 BACKLASH_M = (40e-9, -25e-9)

@@ -15,8 +15,8 @@ from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements, ViewReadings, readings_digest, session_digest
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
-from selfcal_ros.simulation.truth import Truth, random_truth
 from test.support.plans import plan_of
+from test.support.truth import Truth, random_truth
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -13,7 +13,7 @@ from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.truth import Truth, random_truth, simulate_measurements
+from test.support.truth import Truth, random_truth, simulate_measurements
 
 POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "+tx": (0, 1, 0),
          "tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "90+tx": (1, 1, 0),

@@ -7,7 +7,7 @@ from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import ArtifactMap, CalibrationResult, Noise, Observability
-from selfcal_ros.simulation.truth import random_truth
+from test.support.truth import random_truth
 
 
 def random_map(artifact: Artifact, seed: int, *, unknown: tuple = (),

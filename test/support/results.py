@@ -18,9 +18,9 @@ from selfcal_ros.model.result import (
 from selfcal_ros.reporting.chapters import Chapter, chapters, heading
 from selfcal_ros.reporting.report import report_html
 from selfcal_ros.reporting.summary.numbers import truth_arrays
-from selfcal_ros.simulation.truth import hu_plan, random_truth
 from test.support.lattice_plans import in_datum
 from test.support.maps import first_order
+from test.support.truth import hu_plan, random_truth
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
 

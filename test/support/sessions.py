@@ -20,10 +20,10 @@ from selfcal_ros.model.view import Plan, plan_to_dict
 from selfcal_ros.simulation.bag import event_fields, write_simulation
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation
-from selfcal_ros.simulation.truth import random_truth
 from selfcal_ros.topics import INPUT_TOPICS
 from test.support.collecting import gathered
 from test.support.plans import plan_of
+from test.support.truth import random_truth
 
 START_NS = 1_700_000_000_000_000_000
 TAIL = b"\x81\x9f\x93\x01"

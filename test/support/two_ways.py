@@ -8,7 +8,7 @@ import numpy as np
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.simulation.truth import Truth
+from test.support.truth import Truth
 
 
 def maps_of(result: CalibrationResult) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
+from test.support.truth import simulate_measurements
 from tools.reality.__main__ import BEGIN, END, write_table
 from tools.reality.cases import (
     MODEL,

@@ -15,9 +15,9 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
-from selfcal_ros.simulation.truth import hu_plan
 
 ARTIFACT = Artifact(11, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 20e-9, np.deg2rad(0.001)

@@ -8,9 +8,9 @@ import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
-from selfcal_ros.simulation.truth import hu_plan
 from tools.reality.cases import (
     ARTIFACT,
     SETTINGS,

@@ -23,7 +23,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Truth, random_truth
-from selfcal_ros.simulation.truth import FIRST_STAMP_NS, simulate_measurements
+from test.support.truth import FIRST_STAMP_NS, simulate_measurements
 from tools.reality.cases import Case, term_cases
 from tools.reality.machines import machine_cases
 from tools.reality.populations import populations

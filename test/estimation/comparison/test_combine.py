@@ -22,9 +22,9 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map, result_of
 from test.support.options import bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 from tools.combining import ARTIFACT, Case, combined, judged
 
 NO_SHAPES = np.zeros((4, 0))

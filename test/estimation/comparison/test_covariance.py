@@ -23,11 +23,11 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.map_covariance import map_covariance
 from test.support.options import BARE, bare, reference_length
 from test.support.recalibrations import responses, sizes_of
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
 TURNED = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(5, 0.01, 12), lines=1)

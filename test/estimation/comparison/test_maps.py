@@ -15,9 +15,9 @@ from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
 from selfcal_ros.estimation.normal import systems
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import bare
 from test.support.recalibrations import responses, sizes_of
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01, 12)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5

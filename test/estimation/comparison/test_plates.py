@@ -11,10 +11,10 @@ from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.comparison.together import plate_covariance
 from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support import placed
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE
+from test.support.truth import random_truth, simulate_measurements
 
 PLAN = plan_of("0,90,tx", Artifact(5, 0.01, 8), lines=1)
 DRAWS = 150

@@ -15,8 +15,8 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.truth import random_truth, simulate_measurements
 
 NOTHING = np.zeros((3, 0))
 KNOWN = float("inf")

@@ -15,8 +15,8 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense, subset
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01, 12, 5)
 PLAN = plan_of("0,90,tx", ARTIFACT, lines=1)

@@ -14,9 +14,9 @@ from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
+from test.support.truth import simulate_measurements
 
 ARTIFACT = Artifact(5, 0.01)
 PLACE = np.stack([ARTIFACT.x_m, ARTIFACT.y_m])

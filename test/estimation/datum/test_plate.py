@@ -12,9 +12,9 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare, reference_length
+from test.support.truth import simulate_measurements
 
 STEP_M = 1e-7
 

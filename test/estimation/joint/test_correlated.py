@@ -14,9 +14,9 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.dense_fit import DenseFit
 from test.support.results import covered
+from test.support.truth import hu_plan, simulate_measurements
 
 SIZED = "plate_scale:1e-7,plate_shape:5e-9"
 

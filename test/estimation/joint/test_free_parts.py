@@ -9,8 +9,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.plans import plan_of
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 # a turn joins these four sites to each other; without these marks no shift joins them to the others
 APART = {(2, 1), (-1, 2), (-2, -1), (1, -2)}

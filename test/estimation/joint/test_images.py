@@ -17,8 +17,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.plans import image_plan
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 MARK = 2e-8
 ALONE = Options(assumed=())

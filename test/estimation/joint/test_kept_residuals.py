@@ -10,8 +10,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import BARE, bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 
 def measured(sense=Sense.MICROSCOPE_MOVES, *, visits=False, missing=0.0):

@@ -22,9 +22,9 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, measured_in_datum, plan_of
 from test.support.options import BARE, bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 EXACT = 1e-12
 ROOT = Path(__file__).parents[3]
@@ -165,7 +165,7 @@ from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 plan, rng = hu_plan(Artifact(61, 0.01, 24)), np.random.default_rng(0)
 data = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8,
                              sigma_theta_rad=1e-7)

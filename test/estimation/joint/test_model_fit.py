@@ -16,9 +16,9 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
+from test.support.truth import random_truth, simulate_measurements
 
 PITCH, LINES = 0.01, 8
 ARTIFACT = Artifact(5, PITCH, LINES)

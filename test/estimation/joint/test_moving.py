@@ -19,9 +19,9 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
+from test.support.truth import hu_plan, simulate_measurements
 
 SIGMA_M = 20e-9
 FOLLOWS = {"follow_mark": True}

@@ -14,7 +14,7 @@ from selfcal_ros.estimation.joint.problem import (
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 
 @pytest.fixture(scope="module")

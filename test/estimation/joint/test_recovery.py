@@ -14,14 +14,14 @@ from selfcal_ros.estimation.normal import systems
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
-from selfcal_ros.simulation.truth import (
+from test.support.lattice_plans import in_datum, measured_in_datum, plan_of
+from test.support.options import BARE, bare
+from test.support.truth import (
     grid_deviation,
     hu_plan,
     random_truth,
     simulate_measurements,
 )
-from test.support.lattice_plans import in_datum, measured_in_datum, plan_of
-from test.support.options import BARE, bare
 
 EXACT = 1e-12
 

@@ -15,11 +15,11 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import in_datum, plan_of
 from test.support.map_covariance import map_covariance
 from test.support.options import BARE, MARKS, bare, reference_length
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 TABLE = {  # method, section 11: rms of u(G) / sigma of a reading for N = 5, 11, 21
     "0,90,tx": (0.800, 0.890, 0.949), "0,90,180,tx": (0.664, 0.763, 0.825),

@@ -11,8 +11,8 @@ from selfcal_ros.estimation.lattice.connectivity import rest_on_one
 from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.verdict import Finding
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.plans import plan_of
+from test.support.truth import random_truth, simulate_measurements
 
 SIGMA_M = 20e-9
 

@@ -14,8 +14,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.verdict import Finding
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.recalibrations import responses, sizes_of
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
 LAW = Options(method="law", datum_theta="xy_axes")

@@ -25,9 +25,9 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.rank import identifies, plan_observability
 from selfcal_ros.estimation.observability.unseen import is_unseen
 from selfcal_ros.model.view import View
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 
 def dense_rank(plan):

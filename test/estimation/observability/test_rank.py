@@ -13,8 +13,8 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.truth import random_truth, simulate_measurements
 
 PLANS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (0, 1, 0)),
          ((0, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 0, 0), (3, 1, 0), (0, 2, -1)),

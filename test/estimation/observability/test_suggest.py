@@ -31,11 +31,11 @@ from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.tables import search_text, step_text
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.dense_terms import Dense
 from test.support.options import BARE, bare
 from test.support.plans import plan_of
 from test.support.recalibrations import responses, sizes_of
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 BOUNDS = {  # method, section 11: rms gain at N = 5, 11, 21
     "0, 90, tx": (0.800, 0.890, 0.949),

@@ -14,8 +14,8 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import subset
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 FIELD = Artifact(11, 0.01, 0)
 

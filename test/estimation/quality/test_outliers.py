@@ -27,9 +27,9 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(9, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5

@@ -13,9 +13,9 @@ from selfcal_ros.estimation.quality.prediction import HeldReadings, PredictionLi
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
+from test.support.truth import random_truth, simulate_measurements
 
 UNIT_M = 1e-10
 """What a unit of noise is in readings: what is of second order in it is a millionth here."""

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.quality import residuals
 from selfcal_ros.estimation.quality.residuals import residuals_of, view_noise
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
+from test.support.truth import random_truth, simulate_measurements
 
 LINEAR = Options(misalignment_model="linear")
 TURNS = {0.0: ((1, 0), (0, 1)), np.pi / 2: ((0, -1), (1, 0)), np.pi: ((-1, 0), (0, -1))}

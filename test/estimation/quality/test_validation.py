@@ -22,9 +22,9 @@ from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import held_out_text, worded
 from selfcal_ros.reporting.words.tables import validation_json, validation_text, why_text
 from selfcal_ros.simulation.machine import Spread
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(9, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5

@@ -23,10 +23,10 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support import placed
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
+from test.support.truth import simulate_measurements
 from test.support.two_sessions import MICROSCOPE, TwoSessions
 
 PITCH = 0.01

@@ -16,8 +16,8 @@ from selfcal_ros.model.terms import DEFAULT_TERMS, parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.dense_fit import DenseFit
+from test.support.truth import simulate_measurements
 
 PITCH = 0.01
 DEGREE = 2

@@ -9,8 +9,8 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.results import covered
+from test.support.truth import hu_plan, simulate_measurements
 
 NOISE = 20e-9
 

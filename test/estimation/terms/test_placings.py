@@ -16,10 +16,10 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import with_sub_views
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread
-from selfcal_ros.simulation.truth import random_truth
 from test.support.collecting import START_NS, collect
 from test.support.options import BARE, bare
 from test.support.plans import image_plan, plan_of
+from test.support.truth import random_truth
 
 PLAN = image_plan(5, repeats=2)
 

@@ -13,9 +13,9 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.map_covariance import map_covariance
 from test.support.options import bare, reference_length
+from test.support.truth import simulate_measurements
 
 PITCH, SIZE = 0.01, 1e-6
 ARTIFACT = Artifact(5, PITCH, 0)

@@ -16,10 +16,10 @@ from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.estimation.terms.test_terms import plan_of, settings
 from test.support.dense_fit import DenseFit
 from test.support.options import bare
+from test.support.truth import simulate_measurements
 
 CLEAN = Spread(encoder="independent", rotation="finite", phi_rad=1e-4)
 SIZES = {"microscope": 1e-3, "drift": 50e-9, "plate_scale": 1e-6, "plate_shape": 30e-9,

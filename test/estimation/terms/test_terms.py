@@ -18,8 +18,8 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import simulate_measurements
 from test.support.options import bare
+from test.support.truth import simulate_measurements
 
 PITCH = 0.01
 ALL = "microscope,drift,plate_scale,approach"

@@ -19,9 +19,9 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import BARE, bare
 from test.support.results import covered
+from test.support.truth import hu_plan, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01, 24)
 FINE_RAD, COARSE_RAD = 2e-7, 2e-5

@@ -21,8 +21,8 @@ from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.summary.sections import error_section, state_sentence
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare
+from test.support.truth import hu_plan, simulate_measurements
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                         servo_sigma_theta_rad=0.0, stop_sigma_m=20e-6)

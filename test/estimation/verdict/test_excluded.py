@@ -16,8 +16,8 @@ from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.reporting.summary.sections import error_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.options import BARE, bare
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 PLATE = Artifact(9, 0.01, 24)
 SIZE_M = 10e-9

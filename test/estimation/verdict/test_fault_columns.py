@@ -9,8 +9,8 @@ from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.estimation.verdict.off_sites import slip_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.truth import random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
+from test.support.truth import random_truth, simulate_measurements
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
+from test.support.truth import hu_plan, simulate_measurements
 
 ARCSEC_RAD = np.pi / 648_000
 

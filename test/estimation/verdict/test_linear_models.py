@@ -13,9 +13,9 @@ from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import bare
 from test.support.results import covered
+from test.support.truth import hu_plan, simulate_measurements
 
 SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                         servo_sigma_theta_rad=0.0)

@@ -17,8 +17,8 @@ from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
-from selfcal_ros.simulation.truth import hu_plan, simulate_measurements
 from test.support.options import BARE, bare, reference_length
+from test.support.truth import hu_plan, simulate_measurements
 
 N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
 HALF_M = (N - 1) // 2 * PITCH_M

@@ -14,9 +14,9 @@ from selfcal_ros.estimation.verdict.off_sites import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import BARE
 from test.support.results import covered
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(7, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5

@@ -21,8 +21,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.truth import hu_plan, random_truth, simulate_measurements
 from test.support.options import bare
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 FIELD = np.arange(15.0).reshape(5, 3) + 1j * np.arange(15.0, 30.0).reshape(5, 3) ** 2
 

@@ -18,9 +18,9 @@ from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import budget_text, quantity_text
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 ARTIFACT = Artifact(9, 0.01, 24)
 

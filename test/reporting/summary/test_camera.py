@@ -15,8 +15,8 @@ from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.truth import Spread, random_truth, simulate_measurements
 from test.support.plans import image_plan
+from test.support.truth import Spread, random_truth, simulate_measurements
 
 
 @cache

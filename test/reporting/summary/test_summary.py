@@ -33,9 +33,9 @@ from selfcal_ros.reporting.summary.sections import (
     state_sentence,
     summary_text,
 )
-from selfcal_ros.simulation.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.maps import random_map
 from test.support.results import known_result
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 UNSEEN = Observability(5, 7, 2, False, ("non-orthogonality", "scale difference"),
                        ("add a view turned by 90 deg",))

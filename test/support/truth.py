@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings of a machine with known truth, without messages (method eqs. 2.2, 2.3)."""
+"""Readings of a machine with known truth, visit by visit, without messages."""
 
 from dataclasses import replace
 
@@ -7,10 +7,11 @@ import numpy as np
 
 from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.repeats import repeat_motion
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.simulation import cell, physics
+from selfcal_ros.papers import readings as white
+from selfcal_ros.papers.readings import angular_deviation, grid_deviation, hu_plan
+from selfcal_ros.simulation import cell
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import rotate
 
@@ -20,35 +21,6 @@ __all__ = ["Spread", "Truth", "angular_deviation", "grid_deviation", "hu_plan", 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 BETWEEN_VIEWS_NS = 60_000_000_000
 """Time to place the plate again."""
-
-
-def grid_deviation(truth: Truth, index: int, view: View, *,
-                   sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
-    """Return the deviation of every mark in a view, (2, nx, ny), m; NaN off the field.
-
-    For a stage that stops at the nominal position, at the beginning of the view, without
-    noise, with a perfect microscope.
-    """
-    artifact = truth.artifact
-    place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
-    pose, sign = view.on_stage(artifact), -1 if sense is Sense.PLATE_MOVES else 1
-    inside = ~pose.beyond_field(np.stack(pose.site_of(*physics.all_marks(artifact))), artifact)
-    out, stop = np.full_like(site, np.nan), sign * site[:, inside]
-    if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
-        i, j = np.rint(stop / artifact.grid_pitch_m).astype(int) + np.array(artifact.half)[:, None]
-        error = truth.g[:, i, j] + physics.stage_bending(truth, stop, index)
-    else:
-        error = physics.stage_error(truth, stop, index)
-    out[:, inside] = (place - site)[:, inside] + sign * error
-    return out.reshape(2, *artifact.shape)
-
-
-def angular_deviation(truth: Truth, index: int, view: View, *,
-                      sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
-    """Return the noise-free deviation of every angular line in a view, (K,), rad."""
-    direction, nominal, _ = physics.line_directions(truth, index, view)
-    sign = -1 if sense is Sense.PLATE_MOVES else 1
-    return direction - nominal + sign * physics.encoder_error(truth, sign * nominal)
 
 
 def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
@@ -80,10 +52,8 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
         settings = settings or cell.CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
                                                  servo_sigma_theta_rad=0.0)
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
-    views = tuple(_simulate_view(truth, (index, view), rng, sigma=(sigma_m, sigma_theta_rad),
-                                 sense=sense, missing=missing)
-                  for index, view in enumerate(plan.views))
-    return Measurements(plan.plan_id, plan.artifact, views, sense)
+    return white.simulate_measurements(truth, plan, rng, sigma_m=sigma_m, sense=sense,
+                                       sigma_theta_rad=sigma_theta_rad, missing=missing)
 
 
 def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
@@ -96,45 +66,6 @@ def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: c
         views += made
         start_ns += (sum(part.used for part in made) + 1) * settings.period_ns + BETWEEN_VIEWS_NS
     return Measurements(plan.plan_id, plan.artifact, tuple(views), settings.sense)
-
-
-def _simulate_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
-                   sigma: tuple[float, float], sense: Sense, missing: float) -> ViewReadings:
-    index, view = item
-    artifact, repeats = truth.artifact, view.repeats
-    readings = ViewReadings(view, sigma_xy=_repeatability(sigma[0], repeats),
-                            sigma_theta=_repeatability(sigma[1], repeats))
-    if view.grid:
-        v = grid_deviation(truth, index, view, sense=sense)
-        v = v + rng.normal(0, 1, v.shape) * (sigma[0] / np.sqrt(repeats))
-        read = np.isfinite(v).all(axis=0) & (rng.random(artifact.shape) >= missing)
-        readings = replace(readings, m=artifact.m[read], n=artifact.n[read], dx=v[0][read],
-                           dy=v[1][read], count=np.full(read.sum(), repeats),
-                           dof_xy=2 * int(read.sum()) * (repeats - 1))
-    if view.angular:
-        v = angular_deviation(truth, index, view, sense=sense)
-        v = v + rng.normal(0, 1, v.shape) * (sigma[1] / np.sqrt(repeats))
-        read = rng.random(len(v)) >= missing
-        k = np.arange(len(v))[read]
-        readings = replace(readings, k=k, dtheta=v[read], count_theta=np.full(len(k), repeats),
-                           dof_theta=len(k) * (repeats - 1))
-    used = int(readings.count.sum() + readings.count_theta.sum())
-    return replace(readings, used=used)
-
-
-def _repeatability(sigma: float, repeats: int) -> float:
-    return sigma if repeats > 1 else float("nan")
-
-
-def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
-    """Return Hu's four views: identity, 90 deg, one line (angular only), one pitch along +X."""
-    line = 2 * np.pi / artifact.angular_count if artifact.angular_count else 0.0
-    angular = artifact.angular_count > 0
-    views = [View("identity", 0.0, (0.0, 0.0), True, angular, repeats),
-             View("rot90", np.pi / 2, (0.0, 0.0), True, angular, repeats),
-             View("line", line, (0.0, 0.0), False, True, repeats),
-             View("shift_x", 0.0, (artifact.grid_pitch_m, 0.0), True, angular, repeats)]
-    return Plan(plan_id, artifact, tuple(v for v in views if v.grid or angular))
 
 
 def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
