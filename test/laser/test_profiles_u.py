@@ -15,6 +15,7 @@ from selfcal_ros.laser.profiles import (
     u_profile_m,
     u_slope,
 )
+from selfcal_ros.laser.report import geometry
 
 N, STEPS = 5, (0.01, 0.015)
 
@@ -51,6 +52,14 @@ def test_straightness(found, axis, direction, line):
 def test_squareness(found, line):
     wanted = u_of(lambda f: squareness(f, line=line).value, found)
     assert squareness(found, line=line).u == pytest.approx(wanted, rel=1e-6)
+
+
+def test_squareness_and_straightness_are_reported_in_mm_with_their_u(found):
+    out, line = geometry(found, ReferenceLine.END_POINTS), ReferenceLine.END_POINTS
+    for name, value in (("squareness", squareness(found, line=line)),
+                        ("straightness_x", straightness(found, 0, 1, line)),
+                        ("straightness_y", straightness(found, 1, 0, line))):
+        assert (out[name], out[f"u_{name}"]) == pytest.approx((1e3 * value.value, 1e3 * value.u))
 
 
 @pytest.mark.parametrize(("axis", "direction"), [(0, 0), (0, 1), (1, 0), (1, 1)])
