@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft
 
 from selfcal_ros.vision.models import MODELS
 
@@ -42,27 +42,50 @@ def reduced(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return image.astype(np.float32)
     height, width = (side // factor * factor for side in image.shape)
-    rows = image[:height, :width].reshape(height // factor, factor, width)
-    sums = rows.sum(axis=1, dtype=np.uint32)
-    sums = sums.reshape(-1, width // factor, factor).sum(axis=2, dtype=np.uint32)
+    rows = np.zeros((height // factor, width), dtype=np.uint32)
+    for first in range(factor):
+        rows += image[first:height:factor, :width]
+    sums = np.zeros((height // factor, width // factor), dtype=np.uint32)
+    for first in range(factor):
+        sums += rows[:, first::factor]
     return (sums / (factor * factor)).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class _Template:
+    """A mark of norm 1 and mean 0 in a square, and the transform that correlates with it."""
+
+    angle: float
+    square: np.ndarray
+    transform: np.ndarray
+
+
 @lru_cache(maxsize=16)
-def _templates(mark: str, size: float, width: float, shape: tuple[int, int],
-               ) -> tuple[list[tuple[float, np.ndarray]], int]:
-    """Return angle and transform of each template, of norm 1 and mean 0, and half its side."""
-    model, half = MODELS[mark], int(np.ceil(MARGIN * size))
+def _templates(mark: str, size: float, width: float, shape: tuple[int, int], sign: int,
+               ) -> list[_Template]:
+    """Return the templates over the turns of a mark.
+
+    Those of the second half of the turns of a mark without sign, a corner, are the negatives of
+    those of the first half.
+    """
+    model, half = MODELS[mark], _half(size)
     v, u = np.mgrid[-half:half + 1, -half:half + 1].astype(float)
     found = []
-    for angle in np.arange(ANGLES) * model.turns / ANGLES if model.turns else [0.0]:
-        value = model.shape(u.ravel(), v.ravel(), model.start(
+    angles = np.arange(ANGLES if sign else ANGLES // 2) * model.turns / ANGLES
+    for angle in angles if model.turns else [0.0]:
+        value = (sign or 1) * model.shape(u.ravel(), v.ravel(), model.start(
             size, width, float(angle), TEMPLATE_BLUR * size))[0]
         value = value - value.mean()
+        square = (value / np.sqrt(value @ value)).reshape(u.shape).astype(np.float32)
         padded = np.zeros(shape, dtype=np.float32)
-        padded[:2 * half + 1, :2 * half + 1] = (value / np.sqrt(value @ value)).reshape(u.shape)
-        found.append((float(angle), np.conj(fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))))
-    return found, half
+        padded[:2 * half + 1, :2 * half + 1] = square
+        found.append(_Template(float(angle), square, np.conj(
+            fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))))
+    return found
+
+
+def _half(size: float) -> int:
+    return int(np.ceil(MARGIN * size))
 
 
 def _reflected(image: np.ndarray, half: int) -> np.ndarray:
@@ -90,32 +113,52 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
     factor = max(1, int(size / REDUCED_SIZE))
     small = reduced(image, factor)
     small -= small.mean()
-    half = int(np.ceil(MARGIN * size / factor))
+    half = _half(size / factor)
     if min(small.shape) <= half:
         return []
     padded = _reflected(small, half)
-    templates, _ = _templates(mark, size / factor, width / factor, padded.shape)
-    transform = fft.rfft2(padded)
-    part = (slice(half, half + small.shape[0]), slice(half, half + small.shape[1]))
-    best, which = np.full(small.shape, -np.inf, dtype=np.float32), np.zeros(small.shape, np.int8)
-    for number, (_, template) in enumerate(templates):
-        found = fft.irfft2(transform * template, padded.shape)[part].astype(np.float32)
-        found = np.abs(found) if sign == 0 else sign * found
-        better = found > best
-        best[better], which[better] = found[better], number
-    norm = _norm(small, half)
-    correlation = best / norm
-    peaks = ndimage.maximum_filter(best, 2 * round(APART * size / factor) + 1) == best
+    templates = _templates(mark, size / factor, width / factor, padded.shape, sign)
+    best = _correlated(padded, templates, sign)[
+        half:half + small.shape[0], half:half + small.shape[1]]
     amplitude = max(NOISES * max(_noise(small), QUANTUM / factor), FAINT * float(best.max()))
-    good = peaks & (correlation > CORRELATION) & (best > amplitude)
+    peaks = (best > amplitude) & (best == _largest(best, round(APART * size / factor)))
     found_at = []
-    for row, column in zip(*np.nonzero(good), strict=True):
+    for row, column in zip(*np.nonzero(peaks), strict=True):
+        square = padded[row:row + 2 * half + 1, column:column + 2 * half + 1].astype(float)
+        norm = square.size ** 0.5 * max(float(square.std()), 1e-3)
+        correlation = float(best[row, column]) / norm
+        if correlation <= CORRELATION:
+            continue
+        near = [float(np.vdot(template.square, square)) for template in templates]
+        which = int(np.argmax(np.abs(near) if sign == 0 else near))
         finer = (float(column) + _vertex(best[row, :], column),
                  float(row) + _vertex(best[:, column], row))
         found_at.append(Candidate(
             round((finer[0] + 0.5) * factor - 0.5), round((finer[1] + 0.5) * factor - 0.5),
-            templates[which[row, column]][0], float(correlation[row, column])))
+            templates[which].angle, correlation))
     return found_at
+
+
+def _correlated(padded: np.ndarray, templates: list[_Template], sign: int) -> np.ndarray:
+    """Return the largest correlation of each place with a template; without sign, absolute."""
+    transform = fft.rfft2(padded)
+    best = np.full(padded.shape, -np.inf, dtype=np.float32)
+    for template in templates:
+        found = fft.irfft2(transform * template.transform, padded.shape)
+        np.maximum(best, found if sign else np.abs(found, out=found), out=best)
+    return best
+
+
+def _largest(values: np.ndarray, reach: int) -> np.ndarray:
+    """Return the largest value of the square of side 2 `reach` + 1 around each place."""
+    side = 2 * reach + 1
+    for _ in range(2):
+        values = np.pad(values.T, ((reach, reach), (0, 0)), constant_values=-np.inf)
+        width = 1  # of the maxima so far
+        while width < side:
+            step = min(width, side - width)
+            values, width = np.maximum(values[:-step], values[step:]), width + step
+    return values
 
 
 def _vertex(row: np.ndarray, peak: int) -> float:
@@ -124,14 +167,6 @@ def _vertex(row: np.ndarray, peak: int) -> float:
         return 0.0
     before, at, after = row[peak - 1:peak + 2].tolist()
     return (before - after) / (2 * (before - 2 * at + after)) if before + after < 2 * at else 0.0
-
-
-def _norm(image: np.ndarray, half: int) -> np.ndarray:
-    """Return the root of the sum of squared deviations in the square around each pixel."""
-    side = 2 * half + 1
-    mean = ndimage.uniform_filter(image, side, mode="reflect")
-    square = ndimage.uniform_filter(image * image, side, mode="reflect")
-    return side * np.sqrt(np.maximum(square - mean * mean, 1e-6))
 
 
 def _noise(image: np.ndarray) -> float:

@@ -6,16 +6,24 @@ of the weighted fit, its Cramér-Rao bound for normal noise.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
 
 from selfcal_ros.vision.models import SMALLEST_BLUR, MarkModel
 
-ROUNDS, WEIGHTED_ROUNDS = 25, 2
-"""Largest number of unweighted steps, and number of weighted ones."""
+ROUNDS, WEIGHTED_ROUNDS = 25, (2, 8)
+"""Largest number of unweighted steps, smallest and largest number of weighted ones."""
+FEW = 600
+"""Pixels of the unweighted fit, at least, where a mark has more."""
 SETTLED = 1e-3
 """Step of the centre, px, below which the unweighted fit has converged."""
+WEIGHTED_DAMPING = 1e-3
+"""Of the weighted steps: a thin line is hard to tell from a wider and fainter one."""
+SETTLED_SIGMAS = 0.1
+"""Step of each parameter, in standard uncertainties for the others known, below which the weighted
+fit has converged."""
 STAIN, STAIN_SIGMAS = 0.05, 6.0
 """Residual beyond which a pixel is stained: part of the contrast, and standard deviations of
 noise; the larger one counts."""
@@ -30,23 +38,31 @@ LIGHTING = 4
 
 
 @dataclass(frozen=True)
-class Window:
-    """Part of an image around a mark, a disc.
+class Disc:
+    """Places of the pixels of a disc.
 
     Attributes
     ----------
     u, v : float arrays (n,)
         Places of its pixels relative to its centre.
-    value : float array (n,)
-        Their values.
     inside : bool array (h, w)
         Which pixels of the square around it are in it.
+    near : float array (n,)
+        Part of the 3 x 3 pixels around each one that is in it.
     """
 
     u: np.ndarray
     v: np.ndarray
-    value: np.ndarray
     inside: np.ndarray
+    near: np.ndarray
+
+
+@dataclass(frozen=True)
+class Window:
+    """Values (n,) of an image in a disc."""
+
+    disc: Disc
+    value: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -82,75 +98,107 @@ class Fit:
     outer_stains: int
 
 
+@lru_cache(maxsize=2)
+def _disc(radius: float) -> Disc:
+    half = int(np.ceil(radius))
+    v, u = np.mgrid[-half:half + 1, -half:half + 1].astype(float)
+    inside = u * u + v * v <= radius * radius
+    near = ndimage.uniform_filter(inside.astype(float), 3, mode="constant")
+    return Disc(u[inside], v[inside], inside, near[inside])
+
+
 def window_of(image: np.ndarray, column: int, row: int, radius: float) -> Window | None:
     """Return the window around a pixel; None if it reaches beyond the image."""
     half = int(np.ceil(radius))
     if not (half <= column < image.shape[1] - half and half <= row < image.shape[0] - half):
         return None
-    v, u = np.mgrid[-half:half + 1, -half:half + 1].astype(float)
-    inside = u * u + v * v <= radius * radius
+    disc = _disc(radius)
     part = image[row - half:row + half + 1, column - half:column + half + 1]
-    return Window(u[inside], v[inside], part[inside].astype(float), inside)
+    return Window(disc, part[disc.inside].astype(float))
 
 
-def _image(model: MarkModel, window: Window, p: np.ndarray,
+def _image(model: MarkModel, u: np.ndarray, v: np.ndarray, p: np.ndarray,
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the modelled image (n,), its derivatives (n, 6 + shape) and the shape (n,).
+    """Return the modelled image (n,), its derivatives (6 + shape, n) and the shape (n,).
 
     Parameters: centre u and v, ground, contrast, slopes of the illumination, shape.
     """
-    u, v = window.u, window.v
     shape, by = model.shape(u - p[0], v - p[1], p[2 + LIGHTING:])
     light = 1 + p[4] * u + p[5] * v
-    level = p[2] + p[3] * shape
-    jacobian = np.empty((len(u), len(p)))
-    jacobian[:, [0, 1]] = by[:, :2] * (p[3] * light)[:, None]
-    jacobian[:, 2 + LIGHTING:] = by[:, 2:] * (p[3] * light)[:, None]
-    jacobian[:, 2], jacobian[:, 3] = light, light * shape
-    jacobian[:, 4], jacobian[:, 5] = level * u, level * v
+    level, bright = p[2] + p[3] * shape, p[3] * light
+    jacobian = np.empty((len(p), len(u)))
+    np.multiply(by[:2], bright, out=jacobian[:2])
+    np.multiply(by[2:], bright, out=jacobian[2 + LIGHTING:])
+    jacobian[2] = light
+    for row, (one, other) in enumerate(((light, shape), (level, u), (level, v)), start=3):
+        np.multiply(one, other, out=jacobian[row])
     return level * light, jacobian, shape
 
 
-def _first(model: MarkModel, window: Window, shape: np.ndarray) -> np.ndarray:
+def _first(shape: np.ndarray, value: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return the first parameters: levels by linear least squares at the centre of the window."""
-    value, _ = model.shape(window.u, window.v, shape)
-    ground, contrast = np.linalg.lstsq(
-        np.stack([np.ones_like(value), value], axis=1), window.value, rcond=None)[0]
-    return np.concatenate([[0.0, 0.0, ground, contrast, 0.0, 0.0], shape])
+    away = shape - shape.mean()
+    contrast = float(away @ value) / max(float(away @ away), 1e-300)
+    return np.concatenate([
+        [0.0, 0.0, value.mean() - contrast * shape.mean(), contrast, 0.0, 0.0], start])
+
+
+def _normal(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix of diagonal 1, and the scale of each parameter."""
+    normal = jacobian @ jacobian.T
+    scale = np.sqrt(np.diagonal(normal)) + 1e-300
+    return normal / scale / scale[:, None], scale
 
 
 def _solved(jacobian: np.ndarray, residual: np.ndarray, damping: float) -> np.ndarray:
-    normal = jacobian.T @ jacobian
-    scale = np.sqrt(np.diagonal(normal)) + 1e-300
-    normal = normal / scale / scale[:, None]
+    normal, scale = _normal(jacobian)
     normal[np.diag_indices_from(normal)] += damping
-    return np.linalg.solve(normal, jacobian.T @ residual / scale) / scale
+    return np.linalg.solve(normal, jacobian @ residual / scale) / scale
 
 
-def _settled(model: MarkModel, window: Window, p: np.ndarray) -> np.ndarray | None:
-    """Return the parameters of the unweighted fit; None if it does not converge (Marquardt)."""
-    damping, (image, jacobian, _) = 1e-3, _image(model, window, p)
-    cost = np.square(window.value - image).sum()
-    radius = np.sqrt(len(window.u) / np.pi)
+def _diverged(p: np.ndarray, radius: float) -> bool:
+    return not (np.hypot(*p[:2]) <= radius / 2 and np.abs(p[2 + LIGHTING:]).max() < 10 * radius)
+
+
+def _settled(model: MarkModel, window: Window, start: np.ndarray) -> np.ndarray | None:
+    """Return the parameters of the unweighted fit; None if it does not converge (Marquardt).
+
+    It is a start for the weighted one: some of the pixels of a large mark serve.
+    """
+    some = slice(None, None, max(1, len(window.value) // FEW))
+    u, v, value = window.disc.u[some], window.disc.v[some], window.value[some]
+    p = _first(model.shape(u, v, start)[0], value, start)
+    damping, (image, jacobian, _) = 1e-3, _image(model, u, v, p)
+    residual = value - image
+    cost = residual @ residual
+    radius = window.disc.inside.shape[0] / 2
     for _ in range(ROUNDS):
-        step = _solved(jacobian, window.value - image, damping)
+        step = _solved(jacobian, residual, damping)
         tried = p + step
         tried[-1] = max(tried[-1], SMALLEST_BLUR)
-        if np.hypot(*tried[:2]) > radius / 2 or (len(model.names) > 2 and (tried[6:8] <= 0).any()
-                                                 and "width" in model.names):
+        if _diverged(tried, radius) or ("width" in model.names and (tried[6:8] <= 0).any()):
             damping *= 10
             continue
-        new_image, new_jacobian, _ = _image(model, window, tried)
-        new_cost = np.square(window.value - new_image).sum()
+        image, new_jacobian, _ = _image(model, u, v, tried)
+        new_residual = value - image
+        new_cost = new_residual @ new_residual
         if new_cost > cost:
             damping *= 10
             if np.hypot(*step[:2]) < SETTLED:
                 return p
             continue
-        p, image, jacobian, cost, damping = tried, new_image, new_jacobian, new_cost, damping / 10
+        p, residual, jacobian, cost, damping = (
+            tried, new_residual, new_jacobian, new_cost, damping / 10)
         if np.hypot(*step[:2]) < SETTLED and damping < 1e-3:
             return p
     return None
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of at least one value, faster than numpy's for some thousands."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ranked = np.partition(values, (low, high))
+    return float(ranked[low] + ranked[high]) / 2
 
 
 def _noise(residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: np.ndarray,
@@ -163,6 +211,8 @@ def _noise(residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: np.
         return np.full(len(residual), mean)
     low, high = (max(square[part].mean() * factor, mean / 10) for part in (ground, mark))
     at_low, at_high = image[ground].mean(), image[mark].mean()
+    if at_low == at_high:
+        return np.full(len(residual), mean)
     line = low + (high - low) * (image - at_low) / (at_high - at_low)
     return np.clip(line, min(low, high), max(low, high))
 
@@ -179,44 +229,55 @@ def fitted(model: MarkModel, window: Window, start: np.ndarray) -> Fit | None:
     start : float array
         First parameters of the shape.
     """
-    p = _settled(model, window, _first(model, window, start))
-    if p is None or not p[3]:
+    try:
+        p = _settled(model, window, start)
+        return None if p is None or not p[3] else _weighted(model, window, p)
+    except np.linalg.LinAlgError:  # a shape without size or width
         return None
-    for _ in range(WEIGHTED_ROUNDS):
-        image, jacobian, shape = _image(model, window, p)
+
+
+def _weighted(model: MarkModel, window: Window, p: np.ndarray) -> Fit | None:
+    """Return the weighted fit from parameters `p`; None if it diverges or too much is stained."""
+    disc = window.disc
+    for done in range(1, WEIGHTED_ROUNDS[1] + 1):
+        image, jacobian, shape = _image(model, disc.u, disc.v, p)
         residual = window.value - image
-        limit = max(STAIN * abs(p[3]), STAIN_SIGMAS * MAD * float(np.median(np.abs(residual))))
+        limit = max(STAIN * abs(p[3]), STAIN_SIGMAS * MAD * _median(np.abs(residual)))
         used = np.abs(residual) <= limit
         if used.sum() < 2 * len(p):
             return None
         variance = _noise(residual, image, shape, used, len(p))
         root = np.where(used, 1 / np.sqrt(variance), 0.0)
-        weighted = jacobian * root[:, None]
-        p = p + _solved(weighted, residual * root, 1e-12)
+        weighted = jacobian * root
+        normal, scale = _normal(weighted)
+        damped = normal + WEIGHTED_DAMPING * np.eye(len(p))
+        sigmas = np.linalg.solve(damped, weighted @ (residual * root) / scale)
+        p = p + sigmas / scale
         p[-1] = max(p[-1], SMALLEST_BLUR)
-    scale = np.sqrt(np.square(weighted).sum(axis=0)) + 1e-300
-    normal = weighted.T @ weighted / scale / scale[:, None]
+        if _diverged(p, disc.inside.shape[0] / 2):
+            return None
+        if done >= WEIGHTED_ROUNDS[0] and np.abs(sigmas).max() < SETTLED_SIGMAS:
+            break
     covariance = np.linalg.inv(normal)[:2, :2] / scale[:2] / scale[:2, None]
     total = np.square(window.value - window.value.mean()).sum()
     stains = _stains(window, image, shape, p)
     return Fit(p[:2], covariance, dict(zip(model.names, p[6:].tolist(), strict=True)), float(p[3]),
-               float(np.sqrt(np.median(variance))),
-               float(1 - np.square(residual).sum() / max(total, 1e-300)), *stains)
+               _median(variance) ** 0.5,
+               float(1 - residual @ residual / max(total, 1e-300)), *stains)
 
 
 def _stains(window: Window, image: np.ndarray, shape: np.ndarray, p: np.ndarray,
             ) -> tuple[int, int, int, int]:
     """Count stained pixels in the residuals averaged over 3 x 3 pixels, by their kind."""
     residual = window.value - image
-    square = np.zeros(window.inside.shape)
-    square[window.inside] = residual
-    count = ndimage.uniform_filter(window.inside.astype(float), 3, mode="constant")
-    mean = (ndimage.uniform_filter(square, 3, mode="constant") / np.maximum(count, 1e-3))[
-        window.inside]
-    noise = MAD * float(np.median(np.abs(residual))) / np.sqrt(9 * count[window.inside])
+    disc = window.disc
+    square = np.zeros(disc.inside.shape)
+    square[disc.inside] = residual
+    mean = ndimage.uniform_filter(square, 3, mode="constant")[disc.inside] / disc.near
+    noise = MAD * _median(np.abs(residual)) / np.sqrt(9 * disc.near)
     least = STAIN * abs(p[3])
     stained = (np.abs(mean) > np.maximum(least, STAIN_SIGMAS * noise)) & (np.abs(residual) > least)
-    levels = [float(np.median(window.value[part])) if part.any() else level for part, level in (
+    levels = [_median(window.value[part]) if part.any() else level for part, level in (
         (shape < CLEAR, p[2]), (shape > 1 - CLEAR, p[2] + p[3]))]  # robust, as the fit is not
     beyond = 0.25 * (max(levels) - min(levels))
     bright = stained & (mean > 0) & (window.value > max(levels) + beyond)

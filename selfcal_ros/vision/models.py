@@ -10,16 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
 PIXEL_VARIANCE = 1 / 12
 """Variance of the position within a pixel, px²."""
 SMALLEST_BLUR = 0.05
 """Smallest blur of a fit, px."""
 TWO_PI_ROOT = np.sqrt(2 * np.pi)
+ERF_TERM = 0.3275911 / np.sqrt(2)
+ERF_SERIES = (0.5307027145, -0.7265760135, 0.7107068705, -0.142248368, 0.127414796)
+"""Abramowitz and Stegun, 7.1.26: p and half of a5 to a1, for the normal distribution."""
 
 Shaped = tuple[np.ndarray, np.ndarray]
-"""Value (n,) and derivatives (n, 2 + parameters): centre u, centre v, then its parameters."""
+"""Value (n,) and derivatives (2 + parameters, n): centre u, centre v, then its parameters."""
 
 
 @dataclass(frozen=True)
@@ -48,33 +50,51 @@ class MarkModel:
 
 
 def _edge(distance: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a blurred step, 0 at negative distances, its slope, and its derivative by the blur."""
+    """Return a blurred step, 0 at negative distances, its slope, and its derivative by the blur.
+
+    The normal distribution is Abramowitz and Stegun's 7.1.26, within 1e-7: a third of the time of
+    scipy's, as its exponential is that of the slope.
+    """
     variance = blur * blur + PIXEL_VARIANCE
     sigma = np.sqrt(variance)
-    slope = np.exp(distance * distance / (-2 * variance)) / (sigma * TWO_PI_ROOT)
-    return ndtr(distance / sigma), slope, -slope * distance * (blur / variance)
+    bell = np.exp(distance * distance / (-2 * variance))
+    term = np.abs(distance)
+    term *= ERF_TERM / sigma
+    term += 1
+    np.reciprocal(term, out=term)
+    tail = ERF_SERIES[0] * term
+    for coefficient in ERF_SERIES[1:]:
+        tail += coefficient
+        tail *= term
+    tail *= bell
+    bell *= 1 / (sigma * TWO_PI_ROOT)
+    return np.where(distance > 0, 1 - tail, tail), bell, bell * distance * (-blur / variance)
 
 
-def _bar(along: np.ndarray, length: float, blur: float) -> tuple[np.ndarray, ...]:
-    """Return a blurred bar of a length, and its derivatives by position, length and blur."""
-    low, low_slope, low_blur = _edge(along + length / 2, blur)
-    high, high_slope, high_blur = _edge(along - length / 2, blur)
-    return low - high, low_slope - high_slope, (low_slope + high_slope) / 2, low_blur - high_blur
+def _bars(along: np.ndarray, sides: tuple[float, float], blur: float) -> tuple[np.ndarray, ...]:
+    """Return blurred bars of two lengths, and their derivatives by position, length and blur."""
+    half = np.array(sides).reshape(2, *[1] * along.ndim) / 2
+    ends, slopes, by_blur = _edge(np.stack([along + half, along - half]), blur)
+    return (ends[0] - ends[1], slopes[0] - slopes[1], (slopes[0] + slopes[1]) / 2,
+            by_blur[0] - by_blur[1])
 
 
 def _disc(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     radius = np.hypot(u, v)
     inside, slope, by_blur = _edge(p[0] / 2 - radius, p[1])
     outward = slope / np.maximum(radius, 1e-9)
-    return inside, np.stack([outward * u, outward * v, slope / 2, by_blur], axis=1)
+    return inside, np.stack([outward * u, outward * v, slope / 2, by_blur])
 
 
 def _ring(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: outer diameter, width of the line, blur."""
-    outer, by_outer = _disc(u, v, p[[0, 2]])
-    inner, by_inner = _disc(u, v, np.array([p[0] - 2 * p[1], p[2]]))
-    by = by_outer - by_inner
-    return outer - inner, np.insert(by, 3, 2 * by_inner[:, 2], axis=1)
+    radius = np.hypot(u, v)
+    inside, slope, by_blur = _edge(
+        np.stack([p[0] / 2 - radius, p[0] / 2 - p[1] - radius]), p[2])
+    change = slope[0] - slope[1]
+    outward = change / np.maximum(radius, 1e-9)
+    return inside[0] - inside[1], np.stack([
+        outward * u, outward * v, change / 2, slope[1], by_blur[0] - by_blur[1]])
 
 
 def _turned(u: np.ndarray, v: np.ndarray, angle: float,
@@ -87,29 +107,29 @@ def _cross(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: length of the bars, their width, angle of the first one, blur."""
     length, width, angle, blur = p
     a, b, cosine, sine = _turned(u, v, angle)
-    long_a, long_b = _bar(a, length, blur), _bar(b, length, blur)
-    wide_a, wide_b = _bar(a, width, blur), _bar(b, width, blur)
-    only_a, only_b = long_a[0] - wide_a[0], long_b[0] - wide_b[0]
-    shape = long_a[0] * wide_b[0] + wide_a[0] * only_b
-    by_a = long_a[1] * wide_b[0] + wide_a[1] * only_b
-    by_b = long_b[1] * wide_a[0] + wide_b[1] * only_a
-    by_length = long_a[2] * wide_b[0] + wide_a[0] * long_b[2]
-    by_width = only_a * wide_b[2] + wide_a[2] * only_b
-    by_blur = (long_a[3] * wide_b[0] + only_a * wide_b[3] + wide_a[3] * only_b
-               + wide_a[0] * long_b[3])
+    (((long_a, long_b), (wide_a, wide_b)), (to_long, to_wide), (by_long, by_wide),
+     (blur_long, blur_wide)) = _bars(np.stack([a, b]), (length, width), blur)
+    only_a, only_b = long_a - wide_a, long_b - wide_b
+    shape = long_a * wide_b + wide_a * only_b
+    by_a = to_long[0] * wide_b + to_wide[0] * only_b
+    by_b = to_long[1] * wide_a + to_wide[1] * only_a
+    by_length = by_long[0] * wide_b + wide_a * by_long[1]
+    by_width = only_a * by_wide[1] + by_wide[0] * only_b
+    by_blur = (blur_long[0] * wide_b + only_a * blur_wide[1] + blur_wide[0] * only_b
+               + wide_a * blur_long[1])
     return shape, np.stack([sine * by_b - cosine * by_a, -sine * by_a - cosine * by_b, by_length,
-                            by_width, by_a * b - by_b * a, by_blur], axis=1)
+                            by_width, by_a * b - by_b * a, by_blur])
 
 
 def _corner(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: angle of the first edge, blur; squares 1 and 3 between the edges are inside."""
     a, b, cosine, sine = _turned(u, v, p[0])
-    (over_a, slope_a, blur_a), (over_b, slope_b, blur_b) = _edge(a, p[1]), _edge(b, p[1])
+    (over_a, over_b), (slope_a, slope_b), (blur_a, blur_b) = _edge(np.stack([a, b]), p[1])
     odd_a, odd_b = 2 * over_a - 1, 2 * over_b - 1
     by_a, by_b = slope_a * odd_b, odd_a * slope_b
     return (1 + odd_a * odd_b) / 2, np.stack([
         sine * by_b - cosine * by_a, -sine * by_a - cosine * by_b, by_a * b - by_b * a,
-        blur_a * odd_b + odd_a * blur_b], axis=1)
+        blur_a * odd_b + odd_a * blur_b])
 
 
 MODELS = {

@@ -73,6 +73,18 @@ def test_errors_over_their_uncertainty_have_unit_variance(mark):
     assert abs(square.mean() - 1) < 4 * np.sqrt(2 / square.size)
 
 
+def test_thin_lines_are_found_though_their_width_and_contrast_are_hard_to_tell_apart():
+    rng, ratios = np.random.default_rng(3), []
+    for _ in range(60):
+        size = rng.uniform(7, 12)
+        cell = camera("ring", size, blur_px=0.7,
+                      read_noise=0.6 / np.exp(rng.uniform(np.log(20), np.log(200))))
+        found = detector("ring", size)
+        ratios.append(errors(cell, found, rng.uniform(-3, 3, (1, 2)) * PIXEL, rng)[1])
+    square = np.square(np.concatenate(ratios))
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / square.size)
+
+
 def test_pixels_are_counted_from_the_centre_of_the_first_one_and_rows_run_down():
     """A hand-made image: a dark disc, its centre at column 30 and row 14."""
     row, column = np.mgrid[:81, :101]

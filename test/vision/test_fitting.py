@@ -22,3 +22,16 @@ def test_bright_pixels_that_are_noisier_weigh_less():
     square = np.square(ratios)
     assert abs(square.mean() - 1) < 4 * np.sqrt(2 / square.size)
     assert np.sqrt(np.diagonal(fit.covariance)) == pytest.approx([0.05, 0.05], abs=0.02)
+
+
+@pytest.mark.parametrize("mark", MODELS)
+def test_windows_without_a_mark_are_no_error(mark):
+    """Flat, sloping, a step, random, a single bright pixel, waves."""
+    model, rng = MODELS[mark], np.random.default_rng(0)
+    v, u = np.mgrid[:41, :41].astype(float)
+    for size in rng.uniform(6, 24, 20):
+        for image in (u * 0 + 7, u, (u > 20) * 100, rng.integers(0, 2, u.shape) * 255,
+                      (np.hypot(u - 20, v - 20) < 1) * 255, np.sin(u) * np.sin(v)):
+            window = window_of(image, 20, 20, min(model.reach * size + 2, 20.0))
+            fit = fitted(model, window, model.start(size, size / 5, 0.1, 1.0))
+            assert fit is None or fit.centre.shape == (2,)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from selfcal_ros.vision.models import MODELS
 
@@ -20,7 +21,13 @@ def test_derivatives_are_those_of_the_shape(mark):
         change[column] = STEP
         plus, minus = (model.shape(u - sign * change[0], v - sign * change[1],
                                    p + sign * change[2:])[0] for sign in (1, -1))
-        assert by[:, column] == pytest.approx((plus - minus) / (2 * STEP), abs=1e-7)
+        assert by[column] == pytest.approx((plus - minus) / (2 * STEP), abs=3e-5)
+
+
+def test_an_edge_is_a_step_blurred_by_a_gaussian_and_the_pixel():
+    u = np.linspace(0.0, 20.0, 1001)
+    shape, _ = MODELS["disc"].shape(u, np.zeros_like(u), np.array([20.0, 1.1]))
+    assert shape == pytest.approx(ndtr((10 - u) / np.sqrt(1.1 ** 2 + 1 / 12)), abs=1e-7)
 
 
 @pytest.mark.parametrize("mark, inside, outside", [
