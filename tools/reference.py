@@ -51,6 +51,8 @@ PLAN = {
     "map.grid_size": "nodes along x; odd",
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
+    "map.harmonics": "harmonics of the angular map, fewer than half the lines: a Fourier series, "
+                     "for lines at any turn; default: a value for each line",
     "map.grid_size_y": "nodes along y if the map is not square; default: as along x",
     "image": "marks that an image shows: detections of one stamp are one image (docs/bags.md); "
              "default: one mark",

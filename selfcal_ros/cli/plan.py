@@ -198,8 +198,10 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
 def _nodes_text(plan: Plan) -> list[str]:
     """Return the nodes of a map that is not on the plate's lattice, in a line."""
     grid, (nx, ny) = plan.artifact.map_grid, plan.artifact.field.shape
-    return [] if grid is None else [f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
-                                    f"apart, {grid.interpolation} between them"]
+    nodes = [] if grid is None else [f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
+                                     f"apart, {grid.interpolation} between them"]
+    return nodes + ([f"angular map: Fourier series of {plan.artifact.harmonics} harmonics"]
+                    if plan.artifact.harmonics else [])
 
 
 def _image_text(plan: Plan) -> list[str]:

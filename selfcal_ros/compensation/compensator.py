@@ -23,13 +23,10 @@ from selfcal_ros.compensation.cells import (
     Outside,
     bicubic_cells,
     bilinear_cells,
-    cubic_pieces,
 )
+from selfcal_ros.compensation.circle import MAX_SLOPE, Circle, steep
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
-
-MAX_SLOPE = 0.25
-"""Largest slope between neighbours accepted by the inverse: the fixed point converges fast."""
 
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them gets near twice MAX_SLOPE."""
@@ -47,7 +44,8 @@ class Compensator:
     method : {"bilinear", "bicubic"}
         Interpolation between the sites. ``bilinear`` is that of the controller with an
         exported table. ``bicubic`` is the interpolating cubic spline (periodic for theta); it
-        refuses a map with unknown sites, because each of them would affect the whole field.
+        refuses a map with unknown sites, because each of them would affect the whole field. An
+        angular map with harmonics is its Fourier series with both.
     outside : {"clamp", "refuse"}
         Outside the calibrated field: use the error of the nearest point of its edge, or raise.
 
@@ -82,13 +80,14 @@ class Compensator:
                              "bicubic needs all of them: take bilinear or measure them")
         self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
         if self._cells.largest_step > MAX_SLOPE * self._pitch:
-            raise _steep("sites")
+            raise steep("sites")
         if method == "bicubic" and self._cells.largest_step > GENTLE * self._pitch \
                 and self._cells.steepest() > 2 * MAX_SLOPE * self._pitch:
             raise _steep_spline()
         self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
-        self._theta = _Circle(error_map.g_theta, cubic=method == "bicubic")
-        self._u_theta = _Circle(error_map.u_g_theta, cubic=False)
+        self._theta = Circle(error_map.g_theta, cubic=method == "bicubic",
+                             harmonics=error_map.artifact.harmonics)
+        self._u_theta = Circle(error_map.u_g_theta, cubic=False)
 
     @property
     def has_theta(self) -> bool:
@@ -283,57 +282,6 @@ class Compensator:
                              "calibrate with a plate that has them")
 
 
-class _Circle:
-    """A periodic function given at K equidistant angles from 0, linear or cubic in between."""
-
-    def __init__(self, values: np.ndarray, *, cubic: bool) -> None:
-        self._count = len(values)
-        self._holes = bool(np.isnan(values).any())
-        self._closed = np.append(values, values[:1])
-        self._points: list[float] = self._closed.tolist()
-        if cubic and not np.isfinite(values).all():
-            raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
-                             "unknown", "bicubic needs all of them: take bilinear")
-        steps = np.abs(np.diff(self._closed))
-        if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
-            raise _steep("angular lines")
-        self._pieces = cubic_pieces(values, periodic=True) if cubic and self._count else None
-
-    def at(self, angle_rad: np.ndarray) -> np.ndarray:
-        """Return the values at `angle_rad`, any shape; NaN next to unknown lines."""
-        s = angle_rad * (self._count / (2 * np.pi))
-        s = np.where(np.isfinite(s), s, np.nan)
-        if self._holes:
-            s = np.where(np.abs(s - np.round(s)) < SNAP, np.round(s), s)
-        below = np.floor(s)
-        u = s - below
-        with np.errstate(invalid="ignore"):
-            # A position that is not finite becomes some integer; u is NaN and so is the result.
-            i = below.astype(np.int64) % self._count
-        if self._pieces is not None:
-            c = self._pieces[:, i]
-            return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
-        low, high = self._closed[i], self._closed[i + 1]
-        # A line of zero weight is ignored, so that a known line stays known.
-        return np.where(u == 0, low, low + u * (high - low))
-
-    def at_point(self, angle_rad: float) -> float:
-        """Return `at` of one finite angle."""
-        if self._pieces is not None or self._holes:
-            return float(self.at(np.asarray(angle_rad)))
-        s = angle_rad * (self._count / (2 * np.pi))
-        below = math.floor(s)
-        u, i = s - below, below % self._count
-        low, high = self._points[i], self._points[i + 1]
-        return low if u == 0 else low + u * (high - low)
-
-
 def _steep_spline() -> InputError:
     return InputError("error map", "the cubic spline between the sites is steeper than one half",
                       "such a map cannot be inverted: take bilinear, or check its units (m, rad)")
-
-
-def _steep(what: str) -> InputError:
-    return InputError("error map", f"the error changes between neighbouring {what} by more than "
-                      "a quarter of their distance", "such a map cannot be inverted: check its "
-                      "units (m, rad)")

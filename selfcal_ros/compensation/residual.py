@@ -118,8 +118,8 @@ def plane_residuals(error_map: ErrorMap, frame: MachineFrame, correct: Correctio
     the error of the controller's interpolation.
     """
     plate, known = error_map.artifact, error_map.valid
-    plane = replace(error_map, artifact=replace(plate, angular_count=0), g_theta=np.zeros(0),
-                    u_g_theta=np.zeros(0))
+    plane = replace(error_map, artifact=replace(plate, angular_count=0, harmonics=0),
+                    g_theta=np.zeros(0), u_g_theta=np.zeros(0))
     places = [("sites", np.stack([plate.x_m[known], plate.y_m[known]]), Compensator(plane))]
     if known.all():
         centres = np.stack([along[:-1, :-1].ravel() + plate.grid_pitch_m / 2

@@ -56,7 +56,8 @@ def detection(d: Detection, frame_id: str) -> Fields:
 
 def _artifact(artifact: Artifact) -> Fields:
     return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
-            "angular_count": artifact.angular_count, "grid_size_y": artifact.grid_size_y}
+            "angular_count": artifact.angular_count, "grid_size_y": artifact.grid_size_y,
+            "map_harmonics": artifact.harmonics}
 
 
 def _map_grid(artifact: Artifact | None) -> Fields:
@@ -85,7 +86,8 @@ def command(c: Command, frame_id: str) -> Fields:
     """Return the fields of a selfcal_msgs/ViewCommand."""
     view = _view(c.view or View("", grid=False, angular=False, repeats=0))
     plate = _artifact(c.artifact) if c.artifact else {
-        "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0}
+        "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0,
+        "map_harmonics": 0}
     return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
             "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned,
             "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,

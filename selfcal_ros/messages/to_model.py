@@ -112,7 +112,7 @@ def artifact_of(message: Any) -> Artifact:
     """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
     return Artifact(int(message.grid_size), float(message.grid_pitch),
                     int(message.angular_count), int(getattr(message, "grid_size_y", 0)),
-                    _map_grid_of(message))
+                    _map_grid_of(message), int(getattr(message, "map_harmonics", 0)))
 
 
 def _map_grid_of(message: Any) -> MapGrid | None:

@@ -14,6 +14,7 @@ from selfcal_ros.files import checked_fields
 
 MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
+MAX_HARMONICS = 180
 DEFAULT_NODES = 51
 """Largest number of nodes along one side of a map that nobody asked for."""
 PITCH_RANGE_M = (1e-7, 1.0)
@@ -68,11 +69,15 @@ class Artifact:
         Number of marks along y; 0 means `grid_size`.
     map_grid : MapGrid, optional
         Nodes of the error map, for views whose marks do not lie on the lattice.
+    harmonics : int
+        H, harmonics of the angular map, below K/2: a Fourier series, for views at any turn. 0 = one
+        value for each line, for views turned by whole lines.
 
     Raises
     ------
     InputError
-        If a size is even, a size or the pitch is out of range, or K is 1, 2 or negative.
+        If a size is even, a size or the pitch is out of range, K is 1, 2 or negative, or the lines
+        do not determine H harmonics.
     """
 
     grid_size: int
@@ -80,6 +85,7 @@ class Artifact:
     angular_count: int = 0
     grid_size_y: int = 0
     map_grid: MapGrid | None = None
+    harmonics: int = 0
 
     def __post_init__(self) -> None:
         """Refuse sizes without a centre mark and counts without a quarter turn."""
@@ -97,6 +103,11 @@ class Artifact:
         if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:
             raise InputError("artifact angular_count", f"{self.angular_count} is not a number from "
                              f"3 to {MAX_ANGULAR_COUNT}", "give 0 for a plate without lines")
+        most = min((self.angular_count - 1) // 2, MAX_HARMONICS)
+        if self.harmonics and not 0 < self.harmonics <= most:
+            raise InputError("map harmonics", f"{self.harmonics} harmonics cannot be told with "
+                             f"{self.angular_count} lines", f"give 1 to {most}" if most > 0 else
+                             "leave them out for a plate without lines")
         if self.map_grid is not None:
             try:
                 Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
@@ -109,7 +120,7 @@ class Artifact:
         """Lattice of the error map: that of the plate unless `map_grid` is given."""
         grid = self.map_grid
         return self if grid is None else Artifact(
-            grid.size, grid.pitch_m, self.angular_count, grid.size_y)
+            grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics)
 
     @property
     def field_half_m(self) -> tuple[float, float]:
@@ -153,21 +164,26 @@ class Artifact:
         return np.arange(self.angular_count) * (2 * np.pi / max(self.angular_count, 1))
 
 
-def map_grid_to_dict(grid: MapGrid) -> dict[str, Any]:
-    """Return the JSON form of a map's grid: the keys of ``map`` in PLAN.yaml."""
-    return {"grid_size": grid.size, "grid_pitch": grid.pitch_m,
-            "interpolation": str(grid.interpolation),
-            **({"grid_size_y": grid.size_y} if grid.size_y else {})}
+def map_to_dict(artifact: Artifact) -> dict[str, Any]:
+    """Return what a map has of its own in the form of ``map`` in PLAN.yaml; empty if nothing."""
+    grid, own = artifact.map_grid, {}
+    if grid is not None:
+        own = {"grid_size": grid.size, "grid_pitch": grid.pitch_m,
+               "interpolation": str(grid.interpolation),
+               **({"grid_size_y": grid.size_y} if grid.size_y else {})}
+    return own | ({"harmonics": artifact.harmonics} if artifact.harmonics else {})
 
 
-def map_grid_from_dict(data: dict[str, Any]) -> MapGrid:
-    """Return the grid of `map_grid_to_dict`.
+def map_grid_from_dict(data: dict[str, Any]) -> MapGrid | None:
+    """Return the nodes of `map_to_dict`; None if there are none.
 
     Raises
     ------
     KeyError, ValueError
         If a key is missing, or the interpolation is unknown.
     """
+    if not set(data) - {"harmonics"}:
+        return None
     return MapGrid(data["grid_size"], float(data["grid_pitch"]),
                    Interpolation(data["interpolation"]), data.get("grid_size_y", 0))
 
@@ -188,13 +204,19 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
                    sides[1] if sides[1] != sides[0] else 0)
 
 
+def harmonics_of(data: dict, where: str) -> int:
+    """Return the harmonics of the angular map in a plan; 0 if it does not give them."""
+    given = {"harmonics": data.get("harmonics", 0)}
+    return checked_fields(given, where, {"harmonics": int})["harmonics"]
+
+
 def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
     """Return the nodes of the map; None if the plan does not give them."""
-    if not data:
+    if not set(data) - {"harmonics"}:
         return None
     raw = checked_fields(data, where, {"grid_size": int}, {
         "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
-        "grid_size_y": (int, 0)})
+        "grid_size_y": (int, 0), "harmonics": (int, 0)})
     if raw["interpolation"] not in list(Interpolation):
         raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
                          f"use one of {', '.join(Interpolation)}")

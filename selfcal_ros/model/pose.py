@@ -28,12 +28,13 @@ class StagePose(ABC):
     ----------
     shift : tuple
         Position of the plate's centre along stage x and y, pitches.
-    turn_lines : int or None
-        s in 0..K-1, the total turn in angular lines; None if it is no whole number of them.
+    turn_lines : float or None
+        s, 0 to K, the total turn in angular lines: an int unless the map is a Fourier series. None
+        if it is no whole number of them.
     """
 
     shift: tuple[float, float]
-    turn_lines: int | None
+    turn_lines: float | None
 
     @property
     @abstractmethod
@@ -57,7 +58,7 @@ class StagePose(ABC):
         """Return the first n in the field for each m, and the number of marks, int arrays (nx,)."""
 
     @property
-    def s(self) -> int:
+    def s(self) -> float:
         """Turn in angular lines of a plate that has lines.
 
         Raises
@@ -108,7 +109,7 @@ class LatticePose(StagePose):
 
     quarter_turns: int | None
     shift: tuple[int, int]
-    turn_lines: int | None
+    turn_lines: float | None
 
     @property
     def q(self) -> int:
@@ -181,7 +182,7 @@ class PlacedPose(StagePose):
 
     phase: complex
     shift: tuple[float, float]
-    turn_lines: int | None
+    turn_lines: float | None
 
     @property
     def turn_deg(self) -> float:
@@ -328,6 +329,22 @@ def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:
     if whole is None:
         raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps", remedy)
     return whole
+
+
+def turn_in_lines(turn_rad: float, artifact: Artifact) -> float | None:
+    """Return a turn in angular lines, 0 to K: whole unless the map is a Fourier series.
+
+    None if it is not whole, or not finite, or the plate has no lines.
+    """
+    lines, count = turn_rad * artifact.angular_count / (2 * math.pi), artifact.angular_count
+    if not count:
+        return None
+    step = nearest_step(lines)
+    if not artifact.harmonics:
+        return None if step is None else step % count
+    if step is not None and abs(lines - step) < 1e-9:
+        return step % count
+    return lines % count if math.isfinite(lines) else None
 
 
 def image_of(data: dict, artifact: Artifact, where: str) -> Image | None:

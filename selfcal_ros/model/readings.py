@@ -329,6 +329,7 @@ def placing_digest(artifact: Artifact, view: View) -> str:
                view.check_marks, view.check_offset_m)
     text = ",".join(float(number).hex() for number in numbers)
     text += "".join(repr(part) for part in (artifact.map_grid, view.image) if part is not None)
+    text += f",{artifact.harmonics}" if artifact.harmonics else ""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model import json_form
-from selfcal_ros.model.artifact import Artifact, map_grid_from_dict, map_grid_to_dict
+from selfcal_ros.model.artifact import Artifact, map_grid_from_dict, map_to_dict
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.json_form import plain, read
 from selfcal_ros.model.readings import Measurements
@@ -251,7 +251,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                      **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {}),
                      **{key: plain(getattr(amap, key))
                         for key in ("magnification", "u_magnification")}},
-        **({"map": map_grid_to_dict(artifact.map_grid)} if artifact.map_grid else {}),
+        **({"map": own} if (own := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
         "verdict": plain(json_form.verdict_to_dict(result.verdict)),
         "model": plain(result.model),
@@ -314,8 +314,8 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
     artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
-                        raw.get("grid_size_y", 0),
-                        map_grid_from_dict(data["map"]) if "map" in data else None)
+                        raw.get("grid_size_y", 0), map_grid_from_dict(own := data.get("map", {})),
+                        read(int, own.get("harmonics", 0)))
     emap, amap = data["error_map"], data["artifact_map"]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))

@@ -12,8 +12,9 @@ from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import (
     Artifact,
     default_map_grid,
+    harmonics_of,
     map_grid_of,
-    map_grid_to_dict,
+    map_to_dict,
 )
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.pose import (
@@ -25,6 +26,7 @@ from selfcal_ros.model.pose import (
     StagePose,
     image_of,
     nearest_step,
+    turn_in_lines,
     whole_steps,
 )
 from selfcal_ros.model.terms import terms_of, with_microscope
@@ -170,9 +172,9 @@ class View:
             raise InputError(where, f"grid marks cannot be measured at a turn of "
                              f"{math.degrees(self.rotation_rad):.6g} deg",
                              f"turn by 90 deg, set grid to false, or place it on the {OFF}")
-        whole = nearest_step(self.rotation_rad * artifact.angular_count / (2 * math.pi)) is not None
-        lines = self._lines(artifact) if artifact.angular_count and (
-            self.angular or quarter is None or whole) else None
+        lines = turn_in_lines(self.rotation_rad, artifact)
+        if lines is None and artifact.angular_count and (self.angular or quarter is None):
+            lines = self._lines(artifact)
         if lines is None and quarter is None:
             raise InputError(where, "a turn that is not a quarter needs angular lines",
                              "turn by a multiple of 90 deg")
@@ -198,11 +200,12 @@ class View:
                              "every field", "is it in mm? give the translation in metres")
         return a, b
 
-    def _lines(self, artifact: Artifact) -> int:
-        """Return the turn in angular lines, 0..K-1."""
-        turn = self.rotation_rad * artifact.angular_count / (2 * math.pi)
-        return whole_steps(turn, f"view '{self.name}' rotation", "angular line",
-                           "turn by whole lines, or set angular to false") % artifact.angular_count
+    def _lines(self, artifact: Artifact) -> float:
+        """Return the turn in angular lines, 0 to K; whole unless the map is a Fourier series."""
+        lines = turn_in_lines(self.rotation_rad, artifact)
+        return lines if lines is not None else whole_steps(
+            self.rotation_rad * artifact.angular_count / math.tau, f"view '{self.name}' rotation",
+            "angular line", "turn by whole lines, or set angular to false, or give map: harmonics")
 
 
 def _label(cell: tuple[int, int]) -> str:
@@ -253,14 +256,13 @@ def plan_from_dict(data: object, where: str) -> Plan:
     data : object
         Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
-        with ``translation_mm`` instead of ``translation_pitch``,
-        ``visit_order``, for views without their own, ``map {grid_size, grid_pitch,
-        interpolation, grid_size_y}``, the nodes of the map where they are not the plate's sites
-        (default for views off the lattice: `default_map_grid`), ``model_terms``,
-        a list of ``TERM`` or ``TERM:SIZE``, ``check_stops {marks, offset}`` (m) of all views
-        with grid marks, ``microscope {scale_u, rotation_u, shear_u}``, standard uncertainties
-        of the microscope, ``image {nx, ny, pitch_m}``, marks that an exposure shows, and the
-        result ``artifact_from``, which made the plate known.
+        with ``translation_mm`` instead of ``translation_pitch``, ``visit_order``, for views without
+        their own, ``map {grid_size, grid_pitch, interpolation, grid_size_y, harmonics}``, nodes
+        that are not the plate's sites (default off the lattice: `default_map_grid`) and harmonics
+        of the angular map, ``model_terms``, a list of ``TERM`` or ``TERM:SIZE``, ``check_stops
+        {marks, offset}`` (m) of views with grid marks, ``microscope {scale_u, rotation_u,
+        shear_u}``, its standard uncertainties, ``image {nx, ny, pitch_m}``, marks that an exposure
+        shows, and the result ``artifact_from``, which made the plate known.
     where : str
         File name, for messages.
 
@@ -278,7 +280,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
                          {"grid_size": int, "grid_pitch": float, "angular_count": int},
                          {"grid_size_y": (int, 0)})
     artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
-                        raw["grid_size_y"])
+                        raw["grid_size_y"],
+                        harmonics=harmonics_of(fields["map"], f"{where}: map"))
     order = _order(fields["visit_order"], where)
     if len(fields["views"]) > MAX_VIEWS:
         raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
@@ -348,10 +351,9 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
         raise InputError(where, "angular marks are wanted but the plate has none",
                          "set angular to false")
     turn = math.radians(raw["rotation_deg"])
-    if raw["angular"] is None:  # between two lines only grid marks can be read
-        lines = turn * artifact.angular_count / (2 * math.pi)
+    if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines
         raw["angular"] = artifact.angular_count > 0 and (
-            not raw["grid"] or not math.isfinite(lines) or nearest_step(lines) is not None)
+            not raw["grid"] or not math.isfinite(turn) or turn_in_lines(turn, artifact) is not None)
     if not (raw["grid"] or raw["angular"]):
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
     return View(raw["name"], turn, (a, b), raw["grid"], raw["angular"], raw["repeats"],
@@ -387,11 +389,10 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
              "angular_count": artifact.angular_count}
     if artifact.grid_size_y:
         plate["grid_size_y"] = artifact.grid_size_y
-    grid = artifact.map_grid
-    nodes = {} if grid is None else {"map": map_grid_to_dict(grid)}
+    own = map_to_dict(artifact)
     marks, offset_m = plan.check_stops
     image = next((view.image for view in plan.views if view.image), None)
-    return {"plan_id": plan.plan_id, "artifact": plate, **nodes,
+    return {"plan_id": plan.plan_id, "artifact": plate, **({"map": own} if own else {}),
             "views": [view_to_dict(view, artifact) for view in plan.views],
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"image": dict(vars(image))} if image else {}),

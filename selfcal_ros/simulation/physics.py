@@ -251,8 +251,10 @@ def line_directions(truth: Truth, index: int, view: View,
     turn = (np.arange(count) + view.on_stage(truth.artifact).s) % count
     nominal = turn * (2 * np.pi / count)
     lies = truth.placed_as(index, view).on_stage(truth.artifact).s
-    line = (turn - lies) % count
-    direction = nominal + (truth.a_theta[line] + truth.phi_rad[index])
+    nearest = np.rint(turn - lies)
+    line = nearest.astype(int) % count
+    beside = (nearest - (turn - lies)) * (2 * np.pi / count)
+    direction = nominal + (truth.a_theta[line] + truth.phi_rad[index] + beside)
     if len(truth.line_eccentricity_rad):
         x, y = truth.line_eccentricity_rad[index]
         cos, sin = np.cos(direction), np.sin(direction)

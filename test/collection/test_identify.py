@@ -201,3 +201,20 @@ def test_estimate_and_fit_are_folded_by_the_same_whole_pitches():
                           (moved.rigid, (1.2e-3, 0.0024, 0.0013))):
         assert (found.phi_rad, found.tx_m, found.ty_m) == pytest.approx(wanted, abs=1e-12)
     assert (folded.offset_error_m, moved.marks) == (1e-4, 9)
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("count", [7, 24])
+def test_lines_are_found_at_any_turn_of_a_fourier_map(count, told):
+    rng, phi = np.random.default_rng(4), np.deg2rad(0.3)
+    artifact, step = Artifact(11, 0.01, count, harmonics=3), 2 * pi / count
+    view = View("v", np.deg2rad(101.3), grid=False)
+    k = rng.permutation(count)
+    v = phi + rng.normal(0, np.deg2rad(0.01), count)
+    read = k * step + view.rotation_rad + v + 2 * pi * rng.integers(-2, 3, count)
+    for has_id in (np.zeros(count, bool), np.arange(count) % 2 > 0):
+        found = identify_angular(artifact, view, read, ids=k, has_id=has_id, rules=RULES,
+                                 phi_rad=phi if told else None)
+        assert (found.reasons == None).all()  # noqa: E711
+        np.testing.assert_array_equal(found.index, k)
+        np.testing.assert_allclose(found.deviation, v, rtol=0, atol=1e-13)

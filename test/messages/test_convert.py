@@ -110,10 +110,10 @@ def test_fields_of_a_detection_by_name():
         "offset_theta": -7e-3, "sigma": 8e-8, "score": 0.5}
 
 
-PLATE = Artifact(5, 0.0125, 8, 7, MapGrid(9, 0.02, Interpolation.BILINEAR, 11))
+PLATE = Artifact(5, 0.0125, 8, 7, MapGrid(9, 0.02, Interpolation.BILINEAR, 11), 3)
 NO_IMAGE = {"image_nx": 0, "image_ny": 0, "image_pitch": 0.0}
 MAP_FIELDS = {"map_grid_size": 9, "map_grid_size_y": 11, "map_grid_pitch": 0.02,
-              "map_interpolation": "bilinear"}
+              "map_interpolation": "bilinear", "map_harmonics": 3}
 
 
 def test_fields_of_a_command_by_name():
@@ -136,6 +136,7 @@ def test_fields_of_a_command_by_name():
     ({"grid_size": 4}, "artifact grid_size: 4 is not an odd number"),
     ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
     ({"map_grid_size": 4, "map_grid_pitch": 0.1}, "map grid_size: 4 is not an odd number"),
+    ({"angular_count": 7, "map_harmonics": 4}, "map harmonics: 4 harmonics cannot be told with 7"),
     ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the map an odd number"),
     ({"map_grid_size": 5, "map_grid_pitch": 0.1, "map_interpolation": "cubic"},
      "map_interpolation: 'cubic' is not known; use one of bilinear, bicubic"),
@@ -401,6 +402,6 @@ def test_a_field_that_is_not_given_is_an_error():
 def test_a_command_without_a_view_names_no_plate_and_asks_for_nothing():
     made = from_model.command(Command(STAMP_NS, Phase.DONE, "p", 3), "stage")
     for name in ("grid_size", "grid_pitch", "angular_count", "grid_size_y", "repeats",
-                 "map_grid_size", "map_grid_size_y", "map_grid_pitch"):
+                 "map_grid_size", "map_grid_size_y", "map_grid_pitch", "map_harmonics"):
         assert made[name] == 0, name
     assert (made["grid"], made["angular"], made["visit_order"]) == (False, False, "")

@@ -305,3 +305,29 @@ def test_a_plan_has_no_more_cells_than_views():
     many = [{"name": str(number)} for number in range(112)]
     with pytest.raises(InputError, match="image"):
         plan_from_dict(IMAGE | {"views": many, "image": {"nx": 3, "ny": 3}}, "p")
+
+
+def test_a_plan_with_harmonics_reads_lines_at_any_turn():
+    data = plan_with(views=[{"name": "a"}, {"name": "b", "rotation_deg": -37.25, "grid": False},
+                            {"name": "c", "rotation_deg": 375, "grid": False}],
+                     map={"harmonics": 11})
+    plan = plan_from_dict(data, "f")
+    assert (plan.artifact.harmonics, plan.artifact.map_grid) == (11, None)
+    assert [view.angular for view in plan.views] == [True, True, True]
+    turns = [view.on_stage(plan.artifact).s for view in plan.views]
+    assert turns == [0, pytest.approx(24 - 37.25 / 15, abs=1e-12), 1]
+    assert plan_from_dict(plan_to_dict(plan), "f") == plan
+    placed = plan_from_dict(plan_with({"rotation_deg": 37}, map={"harmonics": 3}), "f")
+    assert placed.views[0].angular
+    assert placed.artifact.map_grid == default_map_grid(plan_from_dict(PLAN, "f").artifact)
+    assert placed.artifact.field.harmonics == 3
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"harmonics": 12}, "map harmonics: 12 harmonics cannot be told with 24 lines; give 1 to 11"),
+    ({"harmonics": 1.5}, "f: map: harmonics"),
+    ({"harmonics": 3, "nodes": 5}, "f: map: nodes: unknown key; known are grid_size")])
+def test_harmonics_that_are_refused(given, message):
+    with pytest.raises(InputError) as caught:
+        plan_from_dict(plan_with(map=given), "f")
+    assert str(caught.value).startswith(message)

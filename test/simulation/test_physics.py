@@ -16,7 +16,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.model.visit_order import visit_sequence
 from selfcal_ros.simulation.cell import CellSettings, flicker_noise, grid_exposures, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
-from selfcal_ros.simulation.physics import encoder_error, stage_error
+from selfcal_ros.simulation.physics import encoder_error, line_directions, stage_error
 from test.support.truth import angular_deviation, grid_deviation, simulate_measurements
 
 PLATE = Artifact(3, 0.1, 4)
@@ -422,3 +422,14 @@ def test_of_a_plate_placed_askew_the_nearest_marks_are_found():
     place = truth.placed[0].pose.places(PLACED, *visits.mark) - ASKEW.pose.places(
         PLACED, *visits.mark)
     np.testing.assert_allclose(visits.offset, [place.real, place.imag], atol=1e-15)
+
+
+def test_lines_of_a_plate_that_lies_a_part_of_a_line_off_its_turn():
+    """The nearest line is found, and it is off by that part; the plate lies turned too far."""
+    artifact = replace(PLATE, harmonics=1)
+    commanded, lies = (View("x", np.deg2rad(turn), grid=False) for turn in (37.0, 37.0 + 90 + 2))
+    truth = truth_with(artifact=artifact, a_theta=np.array([1, 2, 3, 4]) * 1e-3, placed=(lies,))
+    direction, nominal, line = line_directions(truth, 0, commanded)
+    np.testing.assert_array_equal(line, [3, 0, 1, 2])
+    np.testing.assert_allclose(np.rad2deg(nominal), [37, 127, 217, 307])
+    np.testing.assert_allclose(direction - nominal, np.deg2rad(2) + truth.a_theta[line])

@@ -249,7 +249,9 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
         return MarkAssignment(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
                           reasons, rigids.Rigid())
     step = 2 * np.pi / count
-    base = view.on_stage(artifact).s
+    whole, part = divmod(view.on_stage(artifact).s, 1)
+    base, between = int(whole), part * step  # a turn between two lines only for a Fourier map
+    reading_rad = wrap(reading_rad - between) if between else reading_rad
     known = has_id & (ids >= 0) & (ids < count)
     told = phi_rad is not None or known.any()
     if phi_rad is None:

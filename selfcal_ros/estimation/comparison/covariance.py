@@ -229,7 +229,8 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
     return system_of(
         Marks(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid]),
               tuple(index for index, *_ in grid)),
-        Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines)))
+        Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines),
+              artifact.harmonics))
 
 
 def _is_read(kept: Any) -> bool:

@@ -208,7 +208,7 @@ def plate_theta_covariance(result: CalibrationResult, known: np.ndarray
 def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     """Return the result with the map of its plate in place of that of the stage."""
     found = result.artifact_map
-    artifact = replace(result.plate, map_grid=None)
+    artifact = replace(result.plate, map_grid=None, harmonics=0)
     nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
     z = (artifact.x_m + 1j * artifact.y_m) / artifact.grid_pitch_m
     known = np.isfinite(found.ax + found.ay)

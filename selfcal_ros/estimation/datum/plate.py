@@ -174,8 +174,8 @@ def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
     for start in range(0, count, BLOCK):
         here = np.arange(start, min(start + BLOCK, count))
         rows = np.tile((known / known.sum())[:, None], len(here))
-        for view, sites in enumerate(angular.site):
-            rows[sites[here], np.arange(len(here))] -= share[view, here]
+        for view in range(angular.n_views):
+            rows -= angular.rows(view, here).T * share[view, here]
         answer = np.tile(turned[:, None], len(here))
         answer[system.phi_at] -= angular.response.T @ rows + share[:, here]
         out[here] += sigma_theta**2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
@@ -192,5 +192,5 @@ def lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
     for at, values in zip(*lines, strict=True):
         own[..., at] = values
     phi = cover.terms.parameters[system.phi_at] / half_width_m
-    found = np.einsum("vk,vkp->kp", share, own - field[system.angular.site] - phi[:, None])
+    found = np.einsum("vk,vkp->kp", share, own - system.angular.gather(field) - phi[:, None])
     return found + field[system.known_lines].mean(axis=0)

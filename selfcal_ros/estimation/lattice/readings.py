@@ -34,8 +34,8 @@ class MapPose:
         return self.pose.phase
 
     @property
-    def turn_lines(self) -> int | None:
-        """Its turn in angular lines; None where that is not a whole number."""
+    def turn_lines(self) -> float | None:
+        """Its turn in angular lines; None between two of them, unless the map is a series."""
         return self.pose.turn_lines
 
     @cached_property
@@ -102,10 +102,11 @@ class AngularData:
     """Angular readings: like `GridData` on the circle, arrays (views, K), rad."""
 
     index: tuple[int, ...]
-    turns: tuple[int, ...]
+    turns: tuple[float, ...]
     y: np.ndarray
     weight: np.ndarray
     sigma_declared: float
+    harmonics: int = 0
 
 
 def grid_data(measurements: Measurements) -> GridData:
@@ -160,7 +161,7 @@ def angular_data(measurements: Measurements) -> AngularData:
         ones.append((k, readings.count_theta, readings.u_theta))
         turns.append(turn)
     sigma = _declare(weight, ones)
-    return AngularData(index, tuple(turns), y, weight, sigma)
+    return AngularData(index, tuple(turns), y, weight, sigma, artifact.harmonics)
 
 
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:

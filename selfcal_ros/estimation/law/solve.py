@@ -131,8 +131,9 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
     """
     artifact = measurements.artifact
     if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count or (
-            artifact.angular_count % 4):
-        raise InputError("method law", "Hu's law needs a square plate with 4, 8, 12, ... lines",
+            artifact.angular_count % 4 or artifact.harmonics):
+        raise InputError("method law", "Hu's law needs a square plate with 4, 8, 12, ... lines "
+                         "and a value at each line",
                          _JOINT)
     wanted: dict[tuple, int] = {
         (0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1, (0, (1, 0), 0): 3}

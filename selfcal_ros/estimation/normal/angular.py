@@ -29,14 +29,14 @@ class AngularSystem:
         Weight of each reading; 0 = not read.
     """
 
-    def __init__(self, turns: tuple[int, ...], weight: np.ndarray) -> None:
+    def __init__(self, turns: tuple[float, ...], weight: np.ndarray) -> None:
         self.turns, self.weight = turns, weight
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.relative_weight = weight / np.where(total > 0, total, 1.0)
         lines = np.arange(weight.shape[1])
-        self.site = (lines + np.array(turns, dtype=int)[:, None]) % max(len(lines), 1)
-        """Stage line of each plate line in each view, (views, K)."""
+        self.site = (lines + np.rint(turns).astype(int)[:, None]) % max(len(lines), 1)
+        """Stage line of each plate line in each view, or the nearest one, (views, K)."""
 
     @property
     def n_views(self) -> int:
@@ -52,6 +52,18 @@ class AngularSystem:
     def n_readings(self) -> int:
         """Number of lines read, over all views."""
         return int(np.count_nonzero(self.read))
+
+    @property
+    def n_unknowns(self) -> int:
+        """Lines of stage and plate."""
+        return 2 * self.n_lines
+
+    @property
+    def rank(self) -> int:
+        """Rank of the readings with known rotations (method eq. 6.2)."""
+        parts = self.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        return int(nodes - len(parts.balanced))
 
     @cached_property
     def components(self) -> Components:
@@ -70,6 +82,20 @@ class AngularSystem:
     def centred(self, y: np.ndarray) -> np.ndarray:
         """Return `y` (views, K, ...) minus the weighted mean of each line over its views."""
         return y - np.einsum("vk,vk...->k...", self.relative_weight, y)
+
+    def gather(self, field: np.ndarray) -> np.ndarray:
+        """Return a map (K, ...) at the plate lines in each view, (views, K, ...)."""
+        return field[self.site]
+
+    def rows(self, view: int, lines: np.ndarray) -> np.ndarray:
+        """Return the rows that lead from the map to plate lines in a view, (lines, K)."""
+        out = np.zeros((len(lines), self.n_lines))
+        out[np.arange(len(lines)), self.site[view, lines]] = 1.0
+        return out
+
+    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+        """Return the covariances (K,) of the map (K, K) at plate lines in one and another view."""
+        return matrix[self.site[one], self.site[other]]
 
     def scatter(self, y: np.ndarray) -> np.ndarray:
         """Return the sum over readings at every stage line, (K, ...)."""
@@ -141,6 +167,6 @@ class AngularSystem:
 
     def plate(self, y: np.ndarray, field: np.ndarray, phi: np.ndarray) -> tuple:
         """Return Atheta (K,) and the residuals (views, K) for given Gtheta and phi."""
-        residual = y - field[self.site] - phi[:, None]
+        residual = y - self.gather(field) - phi[:, None]
         a = np.einsum("vk,vk->k", self.relative_weight, residual)
         return a, np.where(self.read, residual - a, 0.0)

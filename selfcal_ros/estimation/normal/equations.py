@@ -157,9 +157,7 @@ class NormalEquations:
     @cached_property
     def rank_angular(self) -> int:
         """Rank of the angular readings (method eq. 6.2)."""
-        parts = self.angular.components
-        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        return int(nodes - len(parts.balanced) + self.rank_turns)
+        return self.angular.rank + self.rank_turns
 
     @cached_property
     def rank_turns(self) -> int:
@@ -269,7 +267,9 @@ class NormalEquations:
     def known_lines(self) -> np.ndarray:
         """Stage lines determined up to one constant, bool (K,)."""
         parts = self.angular.components
-        known = parts.of_site == parts.largest if len(parts.balanced) else parts.of_site >= 0
+        known = parts.of_site >= 0
+        if len(parts.balanced):
+            known &= parts.of_site == parts.largest
         if self.unseen.shape[1] and known.any():
             moved = self.angular.response @ self.unseen[self.phi_at]
             moved = moved - moved[known].mean(axis=0)

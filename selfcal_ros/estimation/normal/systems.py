@@ -46,25 +46,28 @@ class Marks[Pose]:
         Weights of the marks on the plate.
     index : tuple of int
         Position of the views in the measurement.
+    harmonics : int
+        Of the map, if it is a Fourier series.
     """
 
     poses: tuple[Pose, ...]
     weight: np.ndarray
     index: tuple[int, ...]
+    harmonics: int = 0
 
 
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
     """Return the system of a measured plan, from the cache if the same marks were read."""
     return system_of(Marks(grid.poses, grid.weight, grid.index),
-                     Marks(angular.turns, angular.weight, angular.index))
+                     Marks(angular.turns, angular.weight, angular.index, angular.harmonics))
 
 
-def system_of(grid: Marks[AnyPose], angular: Marks[int]) -> NormalEquations:
+def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     """Return the system of marks that were read, from the cache if present."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
     key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.poses,
-           angular.index, digest.digest())
+           angular.index, angular.harmonics, digest.digest())
     with _lock:
         if key in _cache:
             _cache.move_to_end(key)
@@ -77,9 +80,9 @@ def system_of(grid: Marks[AnyPose], angular: Marks[int]) -> NormalEquations:
     return system
 
 
-def _equations(grid: Marks[AnyPose], angular: Marks[int], *,
+def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
                rank_only: bool = False) -> NormalEquations:
-    lines = AngularSystem(angular.poses, angular.weight)
+    lines = lines_of(angular)
     placed = tuple(pose for pose in grid.poses if isinstance(pose, MapPose))
     if placed:
         from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem  # splines
@@ -88,6 +91,15 @@ def _equations(grid: Marks[AnyPose], angular: Marks[int], *,
     poses = tuple(pose for pose in grid.poses if isinstance(pose, LatticePose))
     return NormalEquations(GridSystem(poses, grid.weight), lines, grid.index, angular.index,
                            rank_only=rank_only)
+
+
+def lines_of(angular: Marks[float]) -> AngularSystem:
+    """Return the equations of the angular readings."""
+    if angular.harmonics and angular.poses:
+        from selfcal_ros.estimation.normal.harmonics import HarmonicSystem  # rarely needed
+
+        return HarmonicSystem(angular.poses, angular.weight, angular.harmonics)
+    return AngularSystem(angular.poses, angular.weight)
 
 
 def _cached_readings() -> int:
@@ -125,7 +137,7 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
     return _equations(
         Marks(poses, weight, tuple(i for i, _ in grid_views)),
         Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
-              tuple(i for i, _ in angular)), rank_only=rank_only)
+              tuple(i for i, _ in angular), artifact.harmonics), rank_only=rank_only)
 
 
 class Memo[Key, Value]:

@@ -42,6 +42,9 @@ PROXY_SIZE = 101
 CHECK_MARKS, CHECK_OFFSET_M = 5, 20e-6
 """Suggested check stops: marks per view, and their distance, m."""
 
+OTHER_TURN_DEG = 37
+"""Turn of a usual view of lines for a Fourier map: 360 deg and it have no common factor."""
+
 MAX_CURES = 5
 """Largest number of sets of views proposed."""
 
@@ -133,17 +136,19 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     artifact : Artifact
         The plate.
     angular : bool
-        Whether angular lines are measured as well; then a turn by one line is included.
+        Whether angular lines are measured as well; then a turn by one line is included, or by
+        `OTHER_TURN_DEG` for a Fourier map.
     """
     pitch = artifact.grid_pitch_m
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
     views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True,
-                  angular and q * artifact.angular_count % 4 == 0)
+                  angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0))
              for (a, b), name in names.items() for q in range(4)
              if q % 2 == 0 or artifact.shape[0] == artifact.shape[1] or (a, b) == (0, 0)]
     if angular and artifact.angular_count:
         line = 2 * math.pi / artifact.angular_count
-        views.append(View("one_line", line, (0.0, 0.0), False, True))
+        views.append(View("one_line", line, (0.0, 0.0), False, True) if not artifact.harmonics else
+                     View(f"{OTHER_TURN_DEG}deg", math.radians(OTHER_TURN_DEG), grid=False))
     return views
 
 
@@ -192,7 +197,7 @@ def smaller(plan: Plan, size: int) -> Plan:
     nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
               for n in plan.artifact.shape)
     plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
-                     0 if nx == ny else ny)
+                     0 if nx == ny else ny, harmonics=plan.artifact.harmonics)
     grid = plan.artifact.map_grid
     return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
         default_map_grid(plate), interpolation=grid.interpolation)))
@@ -203,8 +208,9 @@ def describe_view(view: View, artifact: Artifact) -> str:
     turn = math.degrees(view.rotation_rad) % 360
     if not view.grid:
         lines = view.on_stage(artifact).turn_lines or 0
-        what = (f"an angular view turned by {lines} line{'s' * (lines != 1)} "
-                f"({360 * lines / artifact.angular_count:g} deg)")
+        of_lines = "" if artifact.harmonics else f"{lines} line{'s' * (lines != 1)} ("
+        what = (f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
+                + ")" * bool(of_lines))
     elif 1e-6 < turn < 360 - 1e-6:
         what = f"a view turned by {turn:.6g} deg"
     else:

@@ -11,7 +11,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.estimation.normal.systems import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
@@ -87,12 +90,10 @@ def angular_deficiency(system: NormalEquations) -> int:
     angular = system.angular
     if not angular.n_views:
         return 0
-    parts = angular.components
-    nodes = int((parts.of_site >= 0).sum() + (parts.of_mark >= 0).sum())
     turns = max(system.nullity - (3 * system.grid.n_views - system.rank_schur), 0)
     if system.apart:
         turns = max(turns - 1, 0)
-    return 2 * angular.n_lines - nodes + len(parts.balanced) - 1 + turns
+    return angular.n_unknowns - angular.rank - 1 + turns
 
 
 def measured_observability(system: NormalEquations, artifact: Artifact,
@@ -182,10 +183,8 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
             for x, y in (pose.shift_m for pose in poses)}) < 2:
         advice.append("add a view shifted by one pitch along X")
     if any(view.angular for view in views) and artifact.angular_count:
-        turns = [v.on_stage(artifact).turn_lines or 0 for v in views if v.angular]
-        if _common_step([turn - turns[0] for turn in turns], artifact.angular_count) > 1:
-            advice.append(f"add an angular view turned by one line "
-                          f"({360 / artifact.angular_count:g} deg)")
+        advice += _lines_advice(artifact, [v.on_stage(artifact).turn_lines or 0
+                                           for v in views if v.angular])
     return tuple(advice) or _tried(artifact, views)
 
 
@@ -206,8 +205,26 @@ def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
     return ("add views turned by 90 deg and shifted by one pitch along X and along Y",)
 
 
-def _common_step(turns: list[int], lines: int) -> int:
-    return math.gcd(lines, *turns)
+def _lines_advice(artifact: Artifact, turns: list[float]) -> list[str]:
+    """Return advice on the view of lines that is missing, if one is; turns in lines."""
+    count = artifact.angular_count
+    if artifact.harmonics:
+        lacks = HarmonicSystem(tuple(turns), np.ones((len(turns), count)), artifact.harmonics)
+        best = best_turn_deg(np.array(turns) * (2 * np.pi / count), artifact.harmonics)
+        return [f"add an angular view turned by {best} deg"] if lacks.missed else []
+    apart = [round(turn - turns[0]) for turn in turns]
+    return [f"add an angular view turned by one line ({360 / count:g} deg)"] if math.gcd(
+        count, *apart) > 1 else []
+
+
+def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
+    """Return the turn, in whole degrees, of the further view that tells most of a Fourier map."""
+    of_turns, number = np.exp(1j * np.outer(turns_rad, np.arange(1, harmonics + 1))), len(turns_rad)
+    turns_deg = np.arange(1, 180)
+    more = of_turns.sum(axis=0) + np.exp(
+        1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1)))
+    told = number + 1 - np.abs(more) ** 2 / (number + 1)  # information on each, in 2 / K
+    return int(turns_deg[(1 / np.maximum(told, 1e-12)).sum(axis=1).argmin()])
 
 
 def refusal(observability: Observability) -> str:

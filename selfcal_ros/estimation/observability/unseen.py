@@ -17,6 +17,7 @@ from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inverse
 from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
@@ -184,6 +185,8 @@ def angular_families(system: NormalEquations) -> list[UnseenMode]:
     angular = system.angular
     if not angular.n_views:
         return []
+    if isinstance(angular, HarmonicSystem):
+        return missed_harmonics(angular)
     parts, out = angular.components, []
     n = len(parts.balanced)
     if n > 1:
@@ -193,6 +196,18 @@ def angular_families(system: NormalEquations) -> list[UnseenMode]:
         out.append(UnseenMode("lines never visited", f"{missing} stage angles that no line "
                               "visits", np.zeros((0,))))
     return out
+
+
+def missed_harmonics(lines: HarmonicSystem) -> list[UnseenMode]:
+    """Return the harmonics of the angular map that the readings do not determine, as one family."""
+    if not lines.missed:
+        return []
+    *most, last = (str(number) for number in lines.missed)
+    numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
+    why = ("no view turns the lines" if lines.n_views < 2 else
+           "every turn between views is a whole number of their periods, or nearly so")
+    return [UnseenMode("angular harmonics", f"angular map: harmonic{numbers}, as {why}",
+                       np.zeros((0,)))]
 
 
 def _angular_text(parts: Components, n: int) -> str:

@@ -240,8 +240,8 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
         part[v] += 1.0
         for i in range(angular.n_views):
             for j in range(angular.n_views):
-                variance[v] += part[i] * inverse[angular.site[i], angular.site[j]] * part[j]
-    basis = np.array([angular.centred(-column[angular.site] + unit[:, None]) for column, unit in
+                variance[v] += part[i] * angular.covariance(inverse, i, j) * part[j]
+    basis = np.array([angular.centred(unit[:, None] - angular.gather(column)) for column, unit in
                       zip(angular.response.T, np.eye(angular.n_views), strict=True)])
     spread = np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis)
     return _redundancy(angular.weight, variance + spread)

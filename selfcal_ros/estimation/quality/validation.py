@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.compensation.circle import Circle
 from selfcal_ros.errors import (
     InputError,
     NoDataError,
@@ -249,8 +250,12 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
         sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
         count = measurements.artifact.angular_count
         turn = pose_of(view.view, measurements.artifact).turn_lines or 0
-        site = sign * (view.k + turn) % count
-        theta = (view.dtheta - sign * result.error_map.g_theta[site]
+        site, g = sign * (view.k + turn) % count, result.error_map.g_theta
+        if harmonics := measurements.artifact.harmonics:
+            g_theta = Circle(g, cubic=False, harmonics=harmonics).at(site * (2 * np.pi / count))
+        else:
+            g_theta = g[site]
+        theta = (view.dtheta - sign * g_theta
                  - result.artifact_map.a_theta[view.k])
         phi = known.phi
         if not np.isfinite(phi):

@@ -112,6 +112,8 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
                          f"{_said(mine)}", "name the result of this plate")
     if mine.map_grid is None and other.map_grid is not None:
         mine = replace(mine, map_grid=other.map_grid)
+    if not mine.harmonics:
+        mine = replace(mine, harmonics=other.harmonics)
     return replace(measurements, artifact=mine)
 
 

@@ -249,7 +249,7 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
         here = columns.size[at] * values[view, line]
         noise += np.outer(here, here)
     whole = noise + plate.kept.lines()[1][count:, count:][np.ix_(line, line)]
-    gain = line_gain(angular.turns, weight, whole)
+    gain = line_gain(angular.turns, weight, whole, angular.harmonics)
     found = gain.rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
     found[~gain.rows.any(axis=1)] = np.nan
     rows = gain.rows

@@ -17,6 +17,7 @@ from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
@@ -271,20 +272,31 @@ def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: n
                           "check the readings for misalignments of more than a few degrees")
 
 
-def line_gain(turns: Sequence[int], weight: np.ndarray, noise: np.ndarray) -> Gain:
+def line_gain(turns: Sequence[float], weight: np.ndarray, noise: np.ndarray,
+              harmonics: int = 0) -> Gain:
     """Return the estimate of the angular map from lines of a known plate, its mean 0.
 
     Parameters
     ----------
-    turns : sequence of int
+    turns : sequence of float
         Turn of each view in lines.
     weight : float array (views, K)
         Weight of each reading; 0 = not read.
     noise : float array (r, r)
         Covariance of the readings of weight > 0, in their order, less the known plate.
+    harmonics : int
+        Of the map, if it is a Fourier series; nothing is known if the lines do not determine it.
     """
     view, line = np.nonzero(weight)
     count = weight.shape[1]
+    if harmonics:
+        series = HarmonicSystem(tuple(turns), weight, harmonics)
+        design = np.hstack([series.basis[view, line], np.eye(len(turns))[view]])
+        if np.linalg.matrix_rank(design) < design.shape[1] - 1:
+            return Gain(np.zeros((count, len(view))), noise)
+        told = series.at_lines.shape[1]
+        found = least_squares(design, noise, np.eye(design.shape[1], 1))
+        return Gain(series.at_lines @ found.rows[:told], noise)
     site = (line + np.array(turns, dtype=int)[view]) % count
     told = np.unique(site)
     design = np.zeros((len(view), len(told) + len(turns)))

@@ -320,4 +320,4 @@ def effect_of_line(cause: Cause, artifact: Artifact) -> Effect:
     """Return the effect of a faulty reading of a line: its error at most."""
     theta = np.zeros(artifact.angular_count)
     theta[:] = abs(cause.size) / np.sqrt(max(len(theta), 1))
-    return Effect(cause.name, np.zeros((2, *artifact.shape)), theta)
+    return Effect(cause.name, np.zeros((2, *artifact.field.shape)), theta)

@@ -92,7 +92,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     verdict = Verdict(grade, (*failed, *noises), searched.causes,
                       enlargements(result, searched.terms, [
                           effect for effect in searched.effects if effect.name != LACK_OF_FIT
-                          or LACK_OF_FIT in [cause.name for cause in searched.causes]]))
+                          or (LACK_OF_FIT, effect.unit) in [
+                              (cause.name, cause.unit) for cause in searched.causes]]))
     result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked),
                                                  *_untested(solved)),

@@ -9,6 +9,7 @@ is the lack of fit, a part of the uncertainty at the nodes and between them (eq.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -17,7 +18,8 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.equations import grid_residuals
+from selfcal_ros.estimation.normal.equations import GAP, grid_residuals
+from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.result import CalibrationResult
@@ -44,18 +46,23 @@ class Adequacy:
     ----------
     p : float
         Probability of such an improvement by chance.
-    lack_m : float
-        Standard uncertainty from the lack of fit, one coordinate, m.
+    lack : float
+        Standard uncertainty from the lack of fit: one coordinate, m, or of the angular map, rad.
     coefficients : float
         Further coefficients that the readings determine.
     nodes : tuple of int
-        Nodes of the map along x and y.
+        Nodes of the map along x and y; of the angular map, its harmonics.
     """
 
     p: float
-    lack_m: float
+    lack: float
     coefficients: float
-    nodes: tuple[int, int]
+    nodes: tuple[int, ...]
+
+    @property
+    def of_lines(self) -> bool:
+        """Whether it is that of the angular map."""
+        return len(self.nodes) == 1
 
     def effect(self, result: CalibrationResult) -> Effect:
         """Return the lack of fit as an effect on every known node.
@@ -63,8 +70,11 @@ class Adequacy:
         Its sign changes from node to node: the datum takes nothing of it out.
         """
         emap = result.error_map
+        if self.of_lines:
+            return Effect(NAME, np.zeros((2, *emap.gx.shape)), np.where(
+                np.isfinite(emap.g_theta), self.lack, 0.0))
         sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
-        each = np.where(emap.valid, sign * self.lack_m, 0.0)
+        each = np.where(emap.valid, sign * self.lack, 0.0)
         return Effect(NAME, np.stack([each, each]), np.zeros(len(emap.g_theta)))
 
     @property
@@ -72,8 +82,15 @@ class Adequacy:
         """The cause `roughness`, if the map does not suffice."""
         if not self.p < LEVEL:
             return None
-        return Cause(NAME, self.lack_m, 0.0, "m", self.p, effect_rms=self.lack_m,
-                     effect_max=self.lack_m, details={"nodes": list(self.nodes)})
+        size: dict[str, Any] = {"harmonics": self.nodes[0]} if self.of_lines else {
+            "nodes": list(self.nodes)}
+        return Cause(NAME, self.lack, 0.0, "rad" if self.of_lines else "m", self.p,
+                     effect_rms=self.lack, effect_max=self.lack, details=size)
+
+
+def adequacies_of(model: ModelFit) -> list[Adequacy]:
+    """Return the tests of the map and of the angular map, where they can be made."""
+    return [one for one in (adequacy_of(model), line_adequacy_of(model)) if one is not None]
 
 
 def adequacy_of(model: ModelFit) -> Adequacy | None:
@@ -98,11 +115,45 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if dof < 1 or more < 1:
         return None
     sigma_m = float(np.sqrt(rest / dof))
-    if sigma_m < NOISE_FREE_M:  # there is no F of rounding
-        p = 1.0 if before < 4 * readings * NOISE_FREE_M**2 else 0.0
-    else:
-        p = float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
+    p = _improved(before, rest, more, dof)
     return Adequacy(p, _lack(fine, system, model.y, sigma_m), more, grid.views.shape)
+
+
+def _improved(before: float, rest: float, more: float, dof: float) -> float:
+    """Return the probability of such an improvement by chance (method eq. 12.4)."""
+    if rest < dof * NOISE_FREE_M**2:  # there is no F of rounding
+        return 1.0 if before < 4 * (dof + more) * NOISE_FREE_M**2 else 0.0
+    return float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
+
+
+def line_adequacy_of(model: ModelFit) -> Adequacy | None:
+    """Return the test of the harmonics of the angular map by twice as many, if K allows more.
+
+    None for a map that is no Fourier series, or if nothing more can be determined.
+    """
+    coarse, y = model.problem.system.angular, model.problem.angular.y
+    if not isinstance(coarse, HarmonicSystem):
+        return None
+    finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
+    fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
+    more = fine.n_told - coarse.n_told
+    dof = coarse.n_readings - coarse.n_marks - fine.n_told - (coarse.n_views - 1)
+    if more < 1 or dof < 1:
+        return None
+    (before, coarse_map), (rest, fine_map) = (_fitted_lines(one, y) for one in (coarse, fine))
+    square = float(((fine_map - coarse_map) ** 2).mean()) - rest / dof * (
+        fine.mean_variance - coarse.mean_variance)
+    return Adequacy(_improved(before, rest, more, dof), float(np.sqrt(max(square, 0.0))), more,
+                    (coarse.harmonics,))
+
+
+def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the squares of residuals of lines fitted alone, and their map without its mean."""
+    free, d = lines.reduced(y)
+    phi = np.linalg.pinv(lines.schur, rcond=GAP, hermitian=True) @ d
+    field = free - lines.response @ phi
+    rest = lines.plate(y, field, phi)[1]
+    return float((lines.weight * rest**2).sum()), field - field.mean()
 
 
 def is_untested(model: ModelFit) -> bool:

@@ -35,7 +35,7 @@ from selfcal_ros.estimation.verdict.explanations import (
     find_explanations,
 )
 from selfcal_ros.estimation.verdict.off_sites import READING, off_sites_cause
-from selfcal_ros.estimation.verdict.roughness import adequacy_of
+from selfcal_ros.estimation.verdict.roughness import adequacies_of
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
@@ -144,8 +144,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         found.bounded = False
         if TermName.ROTATION not in [cause.name for cause in causes]:
             causes.append(turned)
-    rough = adequacy_of(_model(solved))
-    if rough is not None:
+    for rough in adequacies_of(_model(solved)):
         found.effects.append(rough.effect(solved.result))
         causes += [rough.cause] if rough.cause else []
     if place is not None:

@@ -47,6 +47,11 @@ class Effect:
     xy: np.ndarray
     theta: np.ndarray
 
+    @property
+    def unit(self) -> str:
+        """``m``, or ``rad`` if only the angular map changes."""
+        return "m" if self.xy.any() else "rad"
+
 
 def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray) -> Effect:
     """Return an effect that is given in the frame of the equations.
@@ -113,9 +118,9 @@ def enlargements(result: CalibrationResult, names: Iterable[str],
             u = np.asarray(result.extra[ANGULAR_KEY][name])
             found.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
     for effect in effects:
-        values, unit = (effect.xy, "m") if effect.xy.any() else (effect.theta, "rad")
+        values = effect.xy if effect.unit == "m" else effect.theta
         found.append(Enlargement(effect.name, rms(values), float(np.abs(values).max(initial=0)),
-                                 unit))
+                                 effect.unit))
     return tuple(sorted(found, key=lambda item: -item.u_rms))
 
 
@@ -340,6 +345,8 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
 
 def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
     g, u = result.error_map.g_theta, result.error_map.u_g_theta
+    if result.plate.harmonics:  # a Fourier series is known between the lines as on them
+        return _interpolation("theta", 0.0, 0.0)
     ring, ring_u = (np.concatenate([a[-1:], a, a[:1]]) for a in (g, u))
     return _interpolation("theta", *_curvature(ring, ring_u, 0))
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures import drawing as draw
@@ -31,6 +32,9 @@ ERRORS = {"stage": "G = indicated − true", "plate": "A = true − nominal"}
 CENTRE: draw.Point = (240.0, 232.0)
 ZERO, ROOM = 112.0, 66.0
 """Radius of the circle of no error, and of the largest error above it; pixels."""
+
+DRAWN = 720
+"""Points of a circle between the lines of a Fourier series."""
 
 MARKED_LINES = 120
 """Lines up to which each has a dot that shows a pointer its value."""
@@ -244,13 +248,19 @@ def angular_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | Non
     angles = emap.artifact.theta_rad
     _rings(drawing, span)
     entries = [("ink", "measured")]
+    between, curve, spread = angles, error, u
+    if emap.artifact.harmonics:  # the series, where the lines are far apart
+        between = np.arange(DRAWN) * (2 * math.pi / DRAWN)
+        stage = Compensator(emap)
+        curve = stage.error_theta(between) * ARCSEC_PER_RAD
+        spread = stage.uncertainty_theta(between) * k * ARCSEC_PER_RAD
     if np.isfinite(u).any():
-        _band(drawing, angles, error, u, span)
+        _band(drawing, between, curve, spread, span)
         entries.append(("band", f"U, k = {k:.3g}"))
     if true is not None:
         _curve(drawing, angles, true, span, colour="truth", width=2.6)
         entries.append(("truth", "known truth"))
-    _curve(drawing, angles, error, span, colour="ink", width=1.3)
+    _curve(drawing, between, curve, span, colour="ink", width=1.3)
     if len(angles) <= MARKED_LINES:
         good = np.flatnonzero(np.isfinite(error))
         drawing.discs([_at(angles[i], error[i], span) for i in good], 1.8, fill="ink")

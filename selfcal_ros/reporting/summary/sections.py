@@ -119,6 +119,8 @@ def measurement_section(result: CalibrationResult) -> Section:
              ("plate", plate),
              *([("map", _nodes(artifact.map_grid, artifact.field.shape))]
                if artifact.map_grid else []),
+             *([("angular map", f"Fourier series, {counted(artifact.harmonics, 'harmonic')}")]
+               if artifact.harmonics else []),
              ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
               f"{result.model.misalignment} misalignments"),
              ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "

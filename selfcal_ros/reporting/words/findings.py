@@ -132,6 +132,8 @@ _CAUSES: dict[str, Words] = {
         f"a stage that stood {of['away'] * MM_PER_M:.3g} mm off the sites, where its error differs "
         f"by {plus_minus(c, UM)}"),
     "roughness": lambda c, of: (
+        f"a rotary encoder rougher than the {of['harmonics']} harmonics of its map follow, by "
+        f"{c.size * ARCSEC_PER_RAD:.3g} arcsec (rms)" if c.unit == "rad" else
         f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map follow, "
         f"by {c.size * UM_PER_M:.3g} µm (rms)"),
     "noise": lambda c, of: (
@@ -151,7 +153,8 @@ _ACTIONS = {
                        "the lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
-    "roughness": "give the map more nodes (map in the plan), and views at other turns and shifts",
+    "roughness": "give the map more nodes, or harmonics if it is the angular one (map in the "
+                 "plan), and views at other turns and shifts",
     "noise": "measure the view again, and look for a source of vibration"}
 """What to do about a cause besides what was tried on the readings."""
 
