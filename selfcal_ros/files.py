@@ -348,7 +348,7 @@ def checked_fields(data: object, where: str, required: dict,
         For a missing or unknown key, or a value of another type.
     """
     if not isinstance(data, dict):
-        raise InputError(where, "not a mapping of keys to values", "see config/plans for examples")
+        raise InputError(where, "not a mapping of keys to values", "see the examples in config")
     optional = optional or {}
     for key in data:
         if key not in required and key not in optional:

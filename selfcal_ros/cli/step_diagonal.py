@@ -21,8 +21,6 @@ HELP = "identify linear, straightness and squareness errors from a laser step-di
 STEP_MM = 10.0
 SHORTEST_MM = 1e-6
 """Shorter steps, below 1 nm, are refused."""
-SEED = 1
-"""Repeats for the noise in the table of sensitivities."""
 JOINTS = "x,y"
 REST_TOLERANCE_UM = 2.0
 MIN_REST_S = 0.5
@@ -52,9 +50,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allow-equal", action="store_true",
                         help="accept X and Y readings that are equal in every block")
     parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
-    parser.add_argument("--sensitivity", action="store_true",
-                        help="without DATA.csv: simulate the effect of each set-up fault on "
-                             "both formulations; table to stdout, JSON with -o, curves with --plot")
     parser.add_argument("--simulate", metavar="SIM.yaml",
                         help="without DATA.csv: write the readings of a simulated measurement to "
                              "-o (or print them); see config/step_diagonal/case_study.yaml")
@@ -81,13 +76,11 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.laser.report import outcome, summary
 
     _check_outputs(args)
-    if args.sensitivity:
-        return _sensitivity(args)
     if args.simulate:
         return _simulate(args)
     if args.data is None or args.method is None:
         raise InputError("arguments", "DATA.csv and --method are required",
-                         "give both, or --sensitivity or --simulate alone")
+                         "give both, or --simulate alone")
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     with busy("identifying"):
@@ -118,13 +111,10 @@ def _check_outputs(args: argparse.Namespace) -> None:
     from selfcal_ros.aerotech.write import refuse_existing
     from selfcal_ros.files import check_outputs
 
-    if args.sensitivity and args.simulate:
-        raise InputError("--sensitivity", "it and --simulate exclude each other",
-                         "omit one of them")
-    measured = not (args.sensitivity or args.simulate)
+    measured = not args.simulate
     for option, path, there, remedy in (
             ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
-            ("--plot", args.plot, not args.simulate, "omit it with --simulate"),
+            ("--plot", args.plot, measured, "omit it with --simulate"),
             ("--cal", args.cal, measured, "it belongs to a measurement"),
             ("--save-csv", args.save_csv, measured and args.data and is_bag(args.data),
              "it belongs to a bag")):
@@ -175,36 +165,11 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
             for pair in sorted(lines)]
 
 
-def _sensitivity(args: argparse.Namespace) -> int:
-    """Simulate every set-up fault on the machine of the source's case study."""
-    import numpy as np
-
-    from selfcal_ros.files import write_json
-    from selfcal_ros.laser.simulation.measure import case_study_machine
-    from selfcal_ros.laser.simulation.sensitivity import sensitivity, sensitivity_text, sweep
-
-    if args.data is not None:
-        raise InputError("arguments", "--sensitivity simulates and reads no data",
-                         "omit DATA.csv")
-    machine, rng = case_study_machine(), np.random.default_rng(SEED)
-    with busy("simulating faults"):
-        rows = sensitivity(machine, rng)
-    if args.plot:
-        from selfcal_ros.laser.report import sensitivity_figure
-        from selfcal_ros.reporting.figures.paper import save_picture
-        save_picture(sensitivity_figure(sweep(machine, rng)), args.plot)
-    table = {"machine": "case study, 6 blocks of 10 mm x 10 mm", "rows": rows}
-    if args.output:
-        write_json(args.output, table)
-    say(args, sensitivity_text(rows), table)
-    return ExitCode.DONE
-
-
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     from selfcal_ros.files import read_yaml, write_json, write_text
-    from selfcal_ros.laser.simulation.config import simulation_from_dict, truth_of
-    from selfcal_ros.laser.simulation.measure import simulate_step_diagonal
+    from selfcal_ros.laser.report import truth_of
+    from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
     from selfcal_ros.laser.table import table_text
 
     if args.data is not None:

@@ -8,11 +8,12 @@ import numpy as np
 
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.laser import profiles
-from selfcal_ros.laser.data import AXES, Method, StepDiagonal, StepDiagonalResult
+from selfcal_ros.laser.data import AXES, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.noise import linear_noise, reading_noise
+from selfcal_ros.laser.simulation import StepMachine
 from selfcal_ros.model.json_form import plain
-from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
-from selfcal_ros.reporting.figures.parts import Curve, chart, legend, titled
+from selfcal_ros.reporting.figures.drawing import Drawing
+from selfcal_ros.reporting.figures.parts import Curve, chart, titled
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, UM_PER_MM
 
 SCHEMA = "selfcal.step_diagonal/1"
@@ -153,11 +154,6 @@ def summary(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-DASHES: dict[str, tuple[float, ...]] = {"conventional": (5, 3), "new": ()}
-NOTHING_UM = 1e-6
-"""What stands for zero on a logarithmic scale."""
-
-
 def coverage(data: StepDiagonal) -> float:
     """Return k for 95.45 % at the fewer degrees of freedom: of readings or of linear errors."""
     known = [noise.dof for noise in (reading_noise(data), linear_noise(data)) if noise.dof]
@@ -182,28 +178,11 @@ def profiles_figure(found: StepDiagonalResult, data: StepDiagonal) -> Drawing:
     return drawing
 
 
-def sensitivity_figure(curves: list[dict]) -> Drawing:
-    """Return the errors of both formulations over the size of laser and mirror angles.
-
-    `curves` is what `sweep` of `selfcal_ros.laser.simulation.sensitivity` gives.
-    """
-    drawing = titled("sensitivity", "Errors in µm over the angle by which laser or mirror are off")
-    drawing.width = 900.0
-    panels = (("linear_m", "linear error of a block"),
-              ("transverse_m", "transverse error of a block"),
-              ("squareness_m", "squareness over the range"))
-    for number, (column, title) in enumerate(panels):
-        chart(drawing, (50 + 295 * number, 56, 235, 240), [
-            Curve(np.array(curve["size"]), np.maximum(np.array(
-                [effect[column] for effect in curve[method]]) * UM_PER_M, NOTHING_UM),
-                f"c{place % SERIES}", dash=dash, dots=1.5)
-            for place, curve in enumerate(curves) for method, dash in DASHES.items()],
-            title=title, labels=("angle in rad", ""), log=True)
-    for place, curve in enumerate(curves):
-        legend(drawing, [(f"c{place % SERIES}", curve["fault"])],
-               (50 + 295 * (place % 3), 356 + 18 * (place // 3)))
-    bottom = 356.0 + 18 * -(-len(curves) // 3)
-    drawing.label(50, bottom, "dashed: conventional formulation, solid: new; the lowest value "
-                  "stands for all below 1 pm", colour="soft")
-    drawing.height = bottom + 14
-    return drawing
+def truth_of(machine: StepMachine) -> dict[str, Any]:
+    """Return the result of a perfect identification of a machine, mm, in the datum of results."""
+    truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
+    errors = {profiles.name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()
+              for j in range(machine.dim) for c in range(machine.dim)}
+    found = geometry(truth, profiles.ReferenceLine.LEAST_SQUARES)
+    return {"unit": "mm", **errors,
+            **{key: value for key, value in found.items() if not key.startswith("u_")}}

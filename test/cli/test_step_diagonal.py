@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,
@@ -124,7 +124,7 @@ def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
     (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be written over"),
     (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be written"),
     (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
-    (("--sensitivity", "--cal", "a.cal"), "--cal: nothing would be written"),
+    (("--simulate", "s.yaml", "--cal", "a.cal"), "--cal: nothing would be written"),
 ])
 def test_outputs_are_refused_before_anything_is_written(tmp_path, monkeypatch, capsys, args,
                                                         message):
@@ -150,12 +150,6 @@ def test_options_that_would_do_nothing_are_refused(capsys, extra):
     assert (code, out) == (2, "") and err.count("\n") == 1
     assert err.startswith(f"selfcal step-diagonal: {extra[0]}: ")
     assert err.endswith("omit it\n")
-
-
-def test_two_simulations_exclude_each_other(capsys):
-    code, out, err = run(capsys, "--sensitivity", "--simulate", CONFIG / "case_study.yaml")
-    assert (code, out, err) == (2, "", "selfcal step-diagonal: --sensitivity: it and --simulate "
-                                       "exclude each other; omit one of them\n")
 
 
 def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
@@ -184,26 +178,12 @@ def test_the_profiles_are_drawn(tmp_path, capsys):
     assert code == 0 and picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_sensitivity_table(tmp_path, capsys, monkeypatch):
-    from selfcal_ros.laser.simulation import sensitivity
-
-    monkeypatch.setattr(sensitivity, "NOISE_DRAWS", 2)
-    monkeypatch.setattr(sensitivity, "SWEEP", (1e-4, 1e-3))
-    out, picture = tmp_path / "s.json", tmp_path / "s.svg"
-    code, text, _ = run(capsys, "--sensitivity", "-o", out, "--plot", picture)
-    rows = json.loads(out.read_text())["rows"]
-    assert code == 0 and len(text.splitlines()) == len(rows) + 2
-    by_name = {row["fault"]: row for row in rows}
-    assert by_name["mirror off, pp"]["new"]["squareness_m"] < 1e-12
-    assert "<svg" in picture.read_text()
-
-
 def test_data_and_method_belong_together(capsys):
     for arguments in ((EXAMPLE,), ("--method", "new")):
         code, _, err = run(capsys, *arguments)
         assert code == 2 and "DATA.csv and --method are required" in err
-    code, _, err = run(capsys, EXAMPLE, "--sensitivity")
-    assert code == 2 and "reads no data" in err
+    code, _, err = run(capsys, EXAMPLE, "--simulate", CONFIG / "case_study.yaml")
+    assert code == 2 and "reads none" in err
 
 
 def test_a_picture_has_a_known_format(tmp_path, capsys):
@@ -231,7 +211,7 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
 
 
 def recorded_bag(path, **options):
-    from selfcal_ros.laser.simulation.measure import case_study_machine
+    from selfcal_ros.laser.simulation import case_study_machine
     from test.support.laser import recorded
     from test.support.laser_bags import write_laser_bag
 

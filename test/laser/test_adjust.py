@@ -5,7 +5,7 @@ import pytest
 from selfcal_ros.laser.adjust import Geometry, adjust
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
 from selfcal_ros.laser.identify import jacobian
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     Measurement,
     SetUp,
     random_machine,

@@ -13,7 +13,7 @@ from selfcal_ros.laser.noise import (
     reading_covariance,
     reading_noise,
 )
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     random_machine,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the step-diagonal measurement: profiles with U, curves over logarithms."""
+"""Figures of the step-diagonal measurement: profiles with U."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from selfcal_ros.laser.data import DIAGONALS, Form, Method
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.profiles import profile_m, u_profile_m
-from selfcal_ros.laser.report import profiles_figure, sensitivity_figure
+from selfcal_ros.laser.report import profiles_figure
 from selfcal_ros.laser.table import Columns, read_table
 from selfcal_ros.reporting.figures.drawing import Discs, Label
 from selfcal_ros.reporting.figures.drawing import Path as Line
@@ -36,18 +36,3 @@ def test_bars_are_as_long_as_u_with_the_k_of_the_repeats():
     assert [low[1] - high[1] for low, high in bars[1]] == pytest.approx(2 * k * u * gain, rel=1e-3)
     title = next(item.text for item in drawing.items if isinstance(item, Label))
     assert title == f"Step diagonal, new formulation; bars: U, k = {k:.3g}"
-
-
-def test_curves_stand_over_powers_of_ten():
-    effect = dict.fromkeys(("linear_m", "transverse_m", "squareness_m"), 1e-9)
-    nothing = dict.fromkeys(effect, 0.0)
-    curves = [{"fault": "mirror off", "size": [1e-4, 1e-3, 1e-2],
-               "conventional": [nothing, effect, dict.fromkeys(effect, 1e-6)],
-               "new": [nothing] * 3}]
-    drawing = sensitivity_figure(curves)
-    low, middle, high = next(item.lines[0] for item in drawing.items if isinstance(item, Line)
-                             and item.dash)
-    assert middle[0] - low[0] == pytest.approx(high[0] - middle[0])
-    assert low[1] - middle[1] == pytest.approx(middle[1] - high[1])  # 1 pm, 1 nm, 1 um
-    words = {item.text for item in drawing.items if isinstance(item, Label)}
-    assert {"10⁻⁴", "10⁻²", "10⁻⁶", "10⁰", "mirror off"} <= words

@@ -9,7 +9,7 @@ from selfcal_ros.laser.data import DIAGONALS, Form, StepDiagonal
 from selfcal_ros.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.laser.noise import check_lengths
 from selfcal_ros.laser.profiles import squareness, straightness
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,

@@ -15,7 +15,7 @@ from selfcal_ros.laser.profiles import (
     squareness_rad,
     u_slope,
 )
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     StepMachine,

@@ -12,7 +12,7 @@ from selfcal_ros.laser.noise import (
     reading_noise,
     time_order,
 )
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     case_study_machine,

@@ -18,7 +18,7 @@ from selfcal_ros.laser.profiles import (
     u_profile_m,
     u_slope,
 )
-from selfcal_ros.laser.simulation.measure import case_study_machine
+from selfcal_ros.laser.simulation import case_study_machine
 from test.support.laser import random_errors
 
 

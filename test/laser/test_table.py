@@ -4,7 +4,7 @@ import pytest
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     random_machine,

@@ -8,7 +8,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
 from selfcal_ros.laser.identify import Choice, identify, identify_wang, jacobian, readings_are_equal
 from selfcal_ros.laser.profiles import squareness
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     Measurement,
     SetUp,
     random_machine,

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.identify import identify_ibaraki
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     Measurement,
     SetUp,
     case_study_machine,

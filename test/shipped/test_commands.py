@@ -17,7 +17,6 @@ ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
     "replay": "run by test/nodes/test_replay.py", "batch": "run by the tests of batch",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
-    "step-diagonal --sensitivity": "takes seconds; run small by test/cli/test_step_diagonal.py",
     "plan suggest": "takes long; run small by test/cli/test_plan.py",
     "cell check": "needs a cell; test/nodes/test_cell_check.py"}
 """Verbs whose commands are parsed alone, and why."""

@@ -156,7 +156,7 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
      "physics, placed, noise, cell, faults, camera, seed, noise_seed, start_time, compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
-    ({"plan": True}, ": plan: not a mapping of keys to values; see config/plans for examples"),
+    ({"plan": True}, ": plan: not a mapping of keys to values; see the examples in config"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "

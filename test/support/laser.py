@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,

@@ -3,13 +3,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.laser.data import Method
-from selfcal_ros.laser.simulation.measure import case_study_machine
-from selfcal_ros.laser.simulation.sensitivity import (
-    FAULTS,
-    effect_of,
-    sensitivity_text,
-    sweep,
-)
+from selfcal_ros.laser.simulation import case_study_machine
+from selfcal_ros.reporting.figures.drawing import Label
+from selfcal_ros.reporting.figures.drawing import Path as Line
+from tools import sensitivity as tool
+from tools.sensitivity import FAULTS, effect_of, main, sensitivity_figure, sensitivity_text, sweep
 
 NM = 1e-9
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -88,7 +86,7 @@ def test_the_table_has_a_line_for_every_row():
 
 
 def test_the_sweep_is_over_the_angles_of_laser_and_mirror(monkeypatch):
-    monkeypatch.setattr("selfcal_ros.laser.simulation.sensitivity.SWEEP", (1e-4, 1e-3))
+    monkeypatch.setattr(tool, "SWEEP", (1e-4, 1e-3))
     rows = sweep(case_study_machine(), np.random.default_rng(0))
     assert [row["fault"] for row in rows] == [
         "mirror off, pp", "mirror off, pp and np equally", "laser off, pp",
@@ -100,3 +98,28 @@ def test_the_sweep_is_over_the_angles_of_laser_and_mirror(monkeypatch):
             expected = effects(row["fault"], size)
             assert [row[str(method)][place] for method in Method] == [
                 pytest.approx(vars(one)) for one in expected]
+
+
+def test_curves_stand_over_powers_of_ten():
+    effect = dict.fromkeys(("linear_m", "transverse_m", "squareness_m"), 1e-9)
+    nothing = dict.fromkeys(effect, 0.0)
+    curves = [{"fault": "mirror off", "size": [1e-4, 1e-3, 1e-2],
+               "conventional": [nothing, effect, dict.fromkeys(effect, 1e-6)],
+               "new": [nothing] * 3}]
+    drawing = sensitivity_figure(curves)
+    low, middle, high = next(item.lines[0] for item in drawing.items if isinstance(item, Line)
+                             and item.dash)
+    assert middle[0] - low[0] == pytest.approx(high[0] - middle[0])
+    assert low[1] - middle[1] == pytest.approx(middle[1] - high[1])  # 1 pm, 1 nm, 1 um
+    words = {item.text for item in drawing.items if isinstance(item, Label)}
+    assert {"10⁻⁴", "10⁻²", "10⁻⁶", "10⁰", "mirror off"} <= words
+
+
+def test_the_table_and_its_curves(tmp_path, capsys, monkeypatch):
+    picture = tmp_path / "s.svg"
+    monkeypatch.setattr(tool, "NOISE_DRAWS", 2)
+    monkeypatch.setattr(tool, "SWEEP", (1e-4, 1e-3))
+    monkeypatch.setattr("sys.argv", ["sensitivity.py", "--plot", str(picture)])
+    assert main() == 0 and "<svg" in picture.read_text()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(FAULTS) + 2 and "mirror off, pp " in lines[4]

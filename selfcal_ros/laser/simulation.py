@@ -2,15 +2,28 @@
 """A step-diagonal measurement of a machine with known errors and a misaligned set-up.
 
 The geometry is traced, independently of the formulas of `selfcal_ros.laser`: a beam along a line
-fixed in space hits the plane of the mirror carried by the machine.
+fixed in space hits the plane of the mirror carried by the machine. Machine, set-up and noise come
+from a YAML file (config/step_diagonal).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
-from selfcal_ros.laser import data
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import checked_fields
+from selfcal_ros.laser.data import (
+    DIAGONALS,
+    MAX_BLOCKS,
+    StepDiagonal,
+    signs_of,
+    step_vectors,
+    turn_to_first_step,
+)
+from selfcal_ros.laser.profiles import name_of
+from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, ONE_PER_PPM, RAD_PER_MRAD, RAD_PER_URAD
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -48,7 +61,7 @@ class StepMachine:
 
     def truth_m(self) -> np.ndarray:
         """Return the errors rotated so that the first X step has no transverse error, m."""
-        turned = data.turn_to_first_step(data.step_vectors(self.steps_m, self.errors_m))
+        turned = turn_to_first_step(step_vectors(self.steps_m, self.errors_m))
         return turned - np.diag(self.steps_m)[:, None, :]
 
 
@@ -108,7 +121,7 @@ class Measurement:
 
 
 def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
-                           rng: np.random.Generator) -> data.StepDiagonal:
+                           rng: np.random.Generator) -> StepDiagonal:
     """Return the readings and linear errors of the measurement.
 
     Parameters
@@ -120,7 +133,7 @@ def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
     rng : numpy.random.Generator
         Source of the noise.
     """
-    names, noise = data.DIAGONALS[machine.dim], measurement.noise
+    names, noise = DIAGONALS[machine.dim], measurement.noise
     n = machine.n_blocks
     samples = np.empty((noise.repeats, len(names), machine.dim, n))
     for k, name in enumerate(names):
@@ -132,7 +145,7 @@ def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
     linear = np.array([machine.errors_m[j, :, j] for j in range(machine.dim)])
     shape = (noise.repeats, machine.dim, n + 1)
     linear = linear + np.diff(rng.normal(0, noise.linear_m, shape), axis=-1)
-    return data.StepDiagonal(machine.steps_m, names, samples, linear)
+    return StepDiagonal(machine.steps_m, names, samples, linear)
 
 
 def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np.ndarray]:
@@ -145,9 +158,9 @@ def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np
     distances : float array (D*n + 1,)
         Laser distance before the first and after every step, m; growing along the diagonal.
     """
-    signs = data.signs_of([name])[0]
+    signs = signs_of([name])[0]
     vectors = np.zeros((machine.dim, machine.n_blocks, 3))
-    vectors[:, :, :machine.dim] = data.step_vectors(machine.steps_m, machine.errors_m)
+    vectors[:, :, :machine.dim] = step_vectors(machine.steps_m, machine.errors_m)
     turns = (np.zeros(vectors.shape) if machine.turns_rad is None else machine.turns_rad)
     order, centres, angles = [], [np.zeros(3)], [np.zeros(3)]
     carried = np.zeros((machine.dim + 1, 3))  # turn of the axes before axis j
@@ -233,3 +246,150 @@ def case_study_machine() -> StepMachine:
     along_x = np.concatenate([[0.0], np.cumsum(errors[0, :, 1])])
     errors[1, :, 0] += (-1.22e-6 - np.polyfit(t, along_x, 1)[0]) / n
     return StepMachine((step, step), errors)
+
+
+MAX_REPEATS = 1000
+LARGEST = 1e9
+"""Largest length, angle or ratio of a set-up, in the units of the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaserSimulation:
+    """Content of a file: machine, measurement, and the generator after drawing the machine."""
+
+    machine: StepMachine
+    measurement: Measurement
+    rng: np.random.Generator
+
+
+def simulation_from_dict(data: object, where: str) -> LaserSimulation:
+    """Return the simulation in a parsed YAML file.
+
+    Parameters
+    ----------
+    data : object
+        ``seed``; ``machine``: ``case_study``, or a mapping of ``steps_mm`` and ``blocks`` and
+        ``sigma_um`` (drawn errors), or of lists ``ex_x, ey_x, ...`` in um, with ``turns_urad``
+        {axis: [[rx, ry, rz], ...]} and ``stacked``; ``setups``: diagonal -> {``laser_mrad``,
+        ``mirror_mrad``, ``to_machine``, ``abbe_mm``, ``scale_ppm``}; ``noise``: {``distance_nm``,
+        ``reading_nm``, ``linear_nm``, ``repeats``}.
+    where : str
+        File name, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown or missing key, or a wrong type.
+    """
+    top = checked_fields(data, where, {}, {"seed": (int, 0), "machine": (object, "case_study"),
+                                           "setups": (dict, {}), "noise": (dict, {})})
+    if top["seed"] < 0:
+        raise InputError(f"{where}: seed", f"{top['seed']} is negative", "give 0 or more")
+    rng = np.random.default_rng(top["seed"])
+    machine = _machine(top["machine"], f"{where}: machine", rng)
+    setups = checked_fields(top["setups"], f"{where}: setups", {},
+                            {name: (dict, None) for name in DIAGONALS[machine.dim]})
+    lengths = ("distance_nm", "reading_nm", "linear_nm")
+    noise = checked_fields(top["noise"], f"{where}: noise", {},
+                           {"repeats": (int, 1), **dict.fromkeys(lengths, (float, 0.0))})
+    repeats = _count(noise["repeats"], f"{where}: noise: repeats", MAX_REPEATS)
+    distance_m, reading_m, linear_m = (
+        _number(noise[key], f"{where}: noise: {key}", positive=True) * M_PER_NM
+        for key in lengths)
+    return LaserSimulation(machine, Measurement(
+        {name: _setup(raw, f"{where}: setups: {name}", machine.dim)
+         for name, raw in setups.items() if raw is not None},
+        LaserNoise(distance_m, reading_m, linear_m, repeats)), rng)
+
+
+def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
+    if raw == "case_study":
+        return case_study_machine()
+    kinds = [name_of(j, c) for j in range(3) for c in range(3)]
+    found = checked_fields(raw, where, {"steps_mm": list}, {
+        "blocks": (int, 6), "sigma_um": (float, 0.1), "stacked": (bool, False),
+        "turns_urad": (dict, {}), **dict.fromkeys(kinds, (list, None))})
+    steps = tuple(np.array(_numbers(found["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM)
+    if min(steps) <= 0:
+        raise InputError(f"{where}: steps_mm", "a step is not positive", "give lengths in mm")
+    dim = len(steps)
+    listed = {kind: found[kind] for kind in kinds if found[kind] is not None}
+    if listed and {"blocks", "sigma_um"} & cast(dict, raw).keys():
+        raise InputError(where, "errors are both listed and drawn", "give one of them")
+    if listed:
+        errors = _errors(listed, where, dim)
+    else:
+        blocks = _count(found["blocks"], f"{where}: blocks", MAX_BLOCKS)
+        sigma = _number(found["sigma_um"], f"{where}: sigma_um", positive=True) * M_PER_UM
+        errors = random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
+    turns = _turns(found["turns_urad"], f"{where}: turns_urad", errors.shape)
+    return StepMachine(steps, errors, turns, found["stacked"])
+
+
+def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
+    kinds = {name_of(j, c): (j, c) for j in range(dim) for c in range(dim)}
+    lists = {}
+    for name, values in listed.items():
+        if name not in kinds:
+            raise InputError(f"{where}: {name}", f"the machine has {dim} steps only",
+                             "leave it out")
+        lists[name] = _numbers(values, f"{where}: {name}", range(1, MAX_BLOCKS + 1))
+    counts = {len(values) for values in lists.values()}
+    if len(counts) > 1:
+        raise InputError(where, f"lists of errors of different lengths {sorted(counts)}",
+                         "give one value a block")
+    errors = np.zeros((dim, counts.pop(), dim))
+    for name, values in lists.items():
+        j, c = kinds[name]
+        errors[j, :, c] = np.array(values) * M_PER_UM
+    return errors
+
+
+def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray | None:
+    axes = "xyz"[:shape[0]]
+    given = checked_fields(raw, where, {}, dict.fromkeys(axes, (list, None)))
+    if not raw:
+        return None
+    turns = np.zeros((shape[0], shape[1], 3))
+    for axis, rows in given.items():
+        if rows is None:
+            continue
+        if len(rows) != shape[1]:
+            raise InputError(f"{where}: {axis}", f"not {shape[1]} rotation vectors",
+                             "give [rx, ry, rz] for every block")
+        turns[axes.index(axis)] = [_numbers(row, f"{where}: {axis}", (3,)) for row in rows]
+    return turns * RAD_PER_URAD
+
+
+def _setup(raw: object, where: str, dim: int) -> SetUp:
+    straight = (list, [0.0] * (dim - 1))
+    given = checked_fields(raw, where, {}, {
+        "laser_mrad": straight, "mirror_mrad": straight, "to_machine": (bool, True),
+        "abbe_mm": (list, [0, 0, 0]), "scale_ppm": (float, 0.0)})
+    laser_rad, mirror_rad = (
+        tuple(np.array(_numbers(given[key], f"{where}: {key}", (dim - 1,))) * RAD_PER_MRAD)
+        for key in ("laser_mrad", "mirror_mrad"))
+    x, y, z = np.array(_numbers(given["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
+    scale = _number(given["scale_ppm"], f"{where}: scale_ppm") * ONE_PER_PPM
+    return SetUp(laser_rad, mirror_rad, given["to_machine"], (x, y, z), scale)
+
+
+def _number(value: object, where: str, *, positive: bool = False) -> float:
+    if (not isinstance(value, int | float) or isinstance(value, bool)
+            or not abs(value) <= LARGEST or (positive and value < 0)):
+        raise InputError(where, f"{value!r} is not a number" + " from 0" * positive,
+                         f"give one within +-{LARGEST:g}")
+    return float(value)
+
+
+def _numbers(value: list, where: str, lengths: tuple[int, ...] | range) -> list[float]:
+    if len(value) not in lengths:
+        wanted = " or ".join(map(str, lengths)) if len(lengths) < 4 else f"1 to {lengths[-1]}"
+        raise InputError(where, f"{value!r} is not a list of {wanted} numbers", "give one")
+    return [_number(item, where) for item in value]
+
+
+def _count(value: int, where: str, most: int) -> int:
+    if not 1 <= value <= most:
+        raise InputError(where, f"{value!r} is not a whole number from 1 to {most}", "give one")
+    return value

@@ -4,7 +4,7 @@ import pytest
 
 from selfcal_ros.laser.data import DIAGONALS
 from selfcal_ros.laser.identify import identify_ibaraki
-from selfcal_ros.laser.simulation.measure import (
+from selfcal_ros.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,

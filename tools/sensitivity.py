@@ -1,20 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effect of set-up faults on both formulations."""
+"""Effect of set-up faults on both formulations of the step-diagonal measurement.
 
+The table of docs/step_diagonal.md: each fault simulated on the machine of the source's case study.
+
+    .venv/bin/python tools/sensitivity.py [--plot FILE]
+"""
+
+import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.laser import simulation as measure
 from selfcal_ros.laser.data import DIAGONALS, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness, straightness
-from selfcal_ros.laser.simulation import measure
+from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
+from selfcal_ros.reporting.figures.paper import save_picture
+from selfcal_ros.reporting.figures.parts import Curve, chart, legend, titled
 from selfcal_ros.units import UM_PER_M
 
 PP, NP = DIAGONALS[2]
 NOISE_DRAWS = 30
+SEED = 1
 Broken = tuple[measure.StepMachine, measure.Measurement]
+DASHES: dict[str, tuple[float, ...]] = {"conventional": (5, 3), "new": ()}
+NOTHING_UM = 1e-6
+"""What stands for zero on a logarithmic scale."""
 SWEEP = tuple(10.0 ** np.arange(-5, -1.9, 0.5))
 """Angles of a sweep, rad."""
 
@@ -178,3 +192,46 @@ def sensitivity_text(rows: list[dict]) -> str:
         lines.append(f"{row['fault']:{width}s} {size:>14s} "
                      + " ".join(f"{value:12.4f}" for value in values))
     return "\n".join(lines)
+
+
+def sensitivity_figure(curves: list[dict]) -> Drawing:
+    """Return the errors of both formulations over the size of laser and mirror angles.
+
+    `curves` is what `sweep` gives.
+    """
+    drawing = titled("sensitivity", "Errors in µm over the angle by which laser or mirror are off")
+    drawing.width = 900.0
+    panels = (("linear_m", "linear error of a block"),
+              ("transverse_m", "transverse error of a block"),
+              ("squareness_m", "squareness over the range"))
+    for number, (column, title) in enumerate(panels):
+        chart(drawing, (50 + 295 * number, 56, 235, 240), [
+            Curve(np.array(curve["size"]), np.maximum(np.array(
+                [effect[column] for effect in curve[method]]) * UM_PER_M, NOTHING_UM),
+                f"c{place % SERIES}", dash=dash, dots=1.5)
+            for place, curve in enumerate(curves) for method, dash in DASHES.items()],
+            title=title, labels=("angle in rad", ""), log=True)
+    for place, curve in enumerate(curves):
+        legend(drawing, [(f"c{place % SERIES}", curve["fault"])],
+               (50 + 295 * (place % 3), 356 + 18 * (place // 3)))
+    bottom = 356.0 + 18 * -(-len(curves) // 3)
+    drawing.label(50, bottom, "dashed: conventional formulation, solid: new; the lowest value "
+                  "stands for all below 1 pm", colour="soft")
+    drawing.height = bottom + 14
+    return drawing
+
+
+def main() -> int:
+    """Print the table, and draw the curves if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--plot", metavar="FILE", help="draw the curves (png, svg or pdf)")
+    args = parser.parse_args()
+    machine, rng = measure.case_study_machine(), np.random.default_rng(SEED)
+    print(sensitivity_text(sensitivity(machine, rng)))
+    if args.plot:
+        save_picture(sensitivity_figure(sweep(machine, rng)), args.plot)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
