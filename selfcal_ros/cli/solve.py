@@ -58,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "certificate (20), e.g. 20.4:0.05:0.5e-6:0.05e-6")
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
-                        "plate_shape, approach, plate_strain, line_eccentricity, rotation; "
+                        "plate_shape, approach, plate_strain, line_eccentricity, rotation, yaw; "
                         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
                         "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
                         "terms, not even those assumed by default (docs/estimation.md)")

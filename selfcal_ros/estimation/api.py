@@ -7,7 +7,7 @@ import numpy as np
 
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
-from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened
+from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened, yaw_of
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
@@ -56,12 +56,14 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         return recheck(measurements, options, known_plate(options.plate, options.plate_from))
     camera, measurements = _camera(measurements, options)
     options = options if camera is None else _knowing(camera, options)
-    solve = solve_law if options.method == "law" else solve_joint
-    result = judged(solve(measurements, options), measurements, options)
+    solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
+    result = judged(solved, measurements, options)
     if not result.verdict.qualified:
         check_placing(measurements)
-    return result if camera is None else replace(
-        result, extra={**result.extra, "camera": camera.to_dict()})
+    yaw = None if solved.model is None else yaw_of(solved.model, measurements.sense)
+    shown = {} if camera is None else camera.to_dict()
+    shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
+    return replace(result, extra={**result.extra, "camera": shown}) if shown else result
 
 
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
@@ -69,7 +71,8 @@ def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None
     straight, camera = measurements, None
     if options.method == "law" or not any(view.view.cell for view in measurements.views):
         return None, measurements
-    plain = replace(options, assumed=(), terms=())
+    plain = replace(options, terms=(), assumed=tuple(
+        term for term in options.model_terms(visits=True) if term.name is TermName.YAW))
     for _ in range(CAMERA_STEPS):
         camera = camera_of(measurements, fit_joint(straight, plain))
         if camera is None:

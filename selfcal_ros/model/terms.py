@@ -31,6 +31,7 @@ class TermName(StrEnum):
     LINE_ECCENTRICITY: the circle of lines is eccentric to the axis of rotation, differently in each
     view, as a fraction of its radius.
     ROTATION: the plate turns between the marks and the lines of a view.
+    YAW: the stage turns, by another angle at each site; only marks off the optical axis show it.
     """
 
     MICROSCOPE = "microscope"
@@ -41,6 +42,7 @@ class TermName(StrEnum):
     PLATE_STRAIN = "plate_strain"
     LINE_ECCENTRICITY = "line_eccentricity"
     ROTATION = "rotation"
+    YAW = "yaw"
 
 
 VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH})
@@ -49,7 +51,7 @@ VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH}
 UNITS: dict[str, str] = {
     TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
     TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m", TermName.PLATE_STRAIN: "m/m",
-    TermName.LINE_ECCENTRICITY: "rad", TermName.ROTATION: "rad"}
+    TermName.LINE_ECCENTRICITY: "rad", TermName.ROTATION: "rad", TermName.YAW: "rad"}
 """Unit of each term's size: a standard deviation known from elsewhere. For a drift it is that at
 the edge of the view's time, for a shape at the middle of the plate's edge."""
 
@@ -62,7 +64,7 @@ NOMINAL_SIZES = {
 OF_PLATE = (TermName.PLATE_SCALE, TermName.PLATE_SHAPE, TermName.PLATE_STRAIN)
 """Terms of the plate itself, which differ between views and turn with it."""
 
-SHARED = (TermName.MICROSCOPE, TermName.APPROACH)
+SHARED = (TermName.MICROSCOPE, TermName.APPROACH, TermName.YAW)
 """Terms whose coefficients all views share."""
 
 OF_LINES = (TermName.LINE_ECCENTRICITY, TermName.ROTATION)
@@ -141,11 +143,13 @@ DEFAULT_TERMS = (
     microscope_term(),
     ModelTerm(TermName.PLATE_STRAIN, 7e-8),
     ModelTerm(TermName.LINE_ECCENTRICITY, 2e-6),
-    ModelTerm(TermName.ROTATION, 1e-7))
+    ModelTerm(TermName.ROTATION, 1e-7),
+    ModelTerm(TermName.YAW, 1e-4))
 """Assumptions for every measurement unless declared (GUM type B): the pixel size is known to 1 %
 and the rotation of the camera to 10 mrad; a plate of fused silica is strained by 5e-8 by clamping
 and by as much again by 0.1 K; the circle of lines is centred to 0.1 um at a radius of 50 mm, and
-moves by 5 nm there between the marks and the lines of a view."""
+moves by 5 nm there between the marks and the lines of a view; the stage turns by 0.1 mrad (20")
+from site to site, more than the yaw of almost any stage, so that images determine it."""
 
 
 def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:

@@ -19,7 +19,13 @@ from selfcal_ros.reporting.figures.maps import (
     component_maps,
     error_map,
 )
-from selfcal_ros.reporting.figures.places import camera_errors, plan_figure, rejected_map, views_in
+from selfcal_ros.reporting.figures.places import (
+    camera_errors,
+    plan_figure,
+    rejected_map,
+    stage_yaw,
+    views_in,
+)
 from selfcal_ros.reporting.figures.residuals import (
     courses,
     distributions,
@@ -28,10 +34,10 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
+from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     aligned_numbers,
-    camera_facts,
     fixed_column,
     printable,
     significant,
@@ -254,7 +260,9 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
         _causes(result), _maps(result, truth), _uncertainty(result), *more, _plate(result),
         Chapter("Camera", _figures((camera_errors(result), "Each vector leads from where a mark is "
-                                    "in the image to where the camera puts it.")),
+                                    "in the image to where the camera puts it."),
+                                    (stage_yaw(result), "How far the image, and with it what the "
+                                     "stage carries, is rotated where the stage stands.")),
                 (Section("Camera", camera_facts(result)),)),
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(

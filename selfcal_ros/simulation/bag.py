@@ -134,8 +134,8 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
 
     gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
     plate_shape, stage_bend (m), plate_scale, plate_strain, plate_tilt and line_eccentricity (rad),
-    empty if none; rotation, microscope, backlash (m); placed, the actual poses of
-    views that are not placed as commanded.
+    empty if none; stage_yaw (rad) at the sites; rotation, microscope, backlash (m); placed, the
+    actual poses of views that are not placed as commanded.
     """
     g = truth.g
     if truth.artifact.map_grid is not None:
@@ -148,8 +148,9 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
         "rotation": "linear" if truth.linear else "finite", "microscope": truth.microscope,
         "backlash": truth.backlash_m, "plate_scale": truth.plate_scale,
         "plate_shape": truth.plate_shape_m, "drift": truth.drift_m, "drift_walk": truth.walk_m,
-        "stage_bend": truth.stage_bend_m, "plate_strain": truth.plate_strain,
-        "plate_tilt": truth.plate_tilt_rad, "line_eccentricity": truth.line_eccentricity_rad,
+        "stage_bend": truth.stage_bend_m, "stage_yaw": truth.yaw,
+        "plate_strain": truth.plate_strain, "plate_tilt": truth.plate_tilt_rad,
+        "line_eccentricity": truth.line_eccentricity_rad,
         "placed": [None if view is None else {
             "rotation": view.rotation_rad, "translation": view.translation_m}
             for view in truth.placed], **more}))

@@ -225,20 +225,19 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     lag = ((truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach[:, visit]
            + physics.settling(truth, came, visit, settings.exposure_period_s))
     stage = position - physics.stage_error(truth, position, index) - lag
-    offset = physics.true_offset(settings.sense, place[:, visit] + moved, stage)
+    at = (truth, settings.sense, position, stage)
     white = _white(rng, settings, size)
     shared = (_normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
               + _flicker(rng, settings.flicker_xy_m, (2, size))
               + _normal(rng, settings.image_xy_m, (2, size)))
-    told = physics.seen_offset(truth, offset) + white + shared
+    told = physics.offset_seen(*at, place[:, visit] + moved) + white + shared
     indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
     others = []
     for sub in view.sub_views:
         if sub.cell is not None and sub.cell != (0, 0):
             marks = physics.marks_beside(truth, index, view, (m, n), sub)
             away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
-            beside = physics.seen_offset(truth, physics.true_offset(
-                settings.sense, away[:, visit] + moved, stage))
+            beside = physics.offset_seen(*at, away[:, visit] + moved)
             others.append(Seen(sub.cell, quantised(
                 beside + _white(rng, settings, size) + shared, settings.resolution_xy_m),
                 np.stack(marks[:2]), there & marks[2]))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Truth of a machine, of a plate, and of each view of the plate on it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,8 @@ class Spread:
     stage_bend_m : float
         Standard deviation of the change of the stage error in each view: coefficients of u^2, uv
         and v^2, where u and v are the indicated position over half the size of the field.
+    stage_yaw_rad : float
+        Standard deviation of the rotation of the stage from site to site, as smooth as its error.
     plate_scale, plate_shape_m, plate_strain : float
         Standard deviations of growth (relative), bending at mid-edge and strain (symmetric matrix,
         relative) of the plate in each view after the first.
@@ -107,6 +109,7 @@ class Spread:
     settling_m: float = 0.0
     settling_time_s: float = 0.01
     stage_bend_m: float = 0.0
+    stage_yaw_rad: float = 0.0
     plate_scale: float = 0.0
     plate_shape_m: float = 0.0
     plate_strain: float = 0.0
@@ -205,6 +208,9 @@ class Truth:
     settling_m, settling_time_s : float
         Indicated - true position of an axis at the first exposure after a motion in + direction,
         in addition to g and backlash, and the time in which it falls to 1/e.
+    yaw : float array (nx, ny) or (0, 0)
+        Rotation of what the stage carries about the optical axis at the sites, counter-clockwise,
+        rad; bilinear in between.
     stage_bend_m : float array (views, 2, 3) or (0, 2, 3)
         Addition to g in a view: as `plate_shape_m`, as a function of the indicated position.
     plate_scale : float array (views,) or (0,)
@@ -249,6 +255,7 @@ class Truth:
     settling_m: float = 0.0
     settling_time_s: float = 0.01
     stage_bend_m: np.ndarray = _zeros(0, 2, 3)
+    yaw: np.ndarray = _zeros(0, 0)
     plate_scale: np.ndarray = _zeros(0)
     plate_shape_m: np.ndarray = _zeros(0, 2, 3)
     plate_strain: np.ndarray = _zeros(0, 2, 2)
@@ -301,6 +308,10 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
     drawn_theta, waves_theta = _circle(artifact.angular_count, spread, rng)
     g_theta = _encoder(artifact, g, drawn_theta, spread.encoder)
     a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
+    yaw = np.zeros((0, 0))
+    if spread.stage_yaw_rad:
+        yaw = _stage(artifact, replace(spread, g_m=spread.stage_yaw_rad), rng)[0][0]
+        yaw = yaw - yaw.mean()  # the rest turns the image as the camera's turn does
     rng = placing or rng
     phi, t = rng.normal(0, spread.phi_rad, n_views), rng.normal(0, spread.t_m, (n_views, 2))
     drawn = _of_views(spread, n_views, rng)
@@ -314,7 +325,7 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
         np.array([spread.backlash_x_m, spread.backlash_y_m]), spread.backlash_growth_m,
         spread.settling_m, spread.settling_time_s, plate_bow_m=spread.plate_bow_m,
-        waves=waves, waves_theta=waves_theta, **drawn)
+        waves=waves, waves_theta=waves_theta, yaw=yaw, **drawn)
 
 
 def _stage(artifact: Artifact, spread: Spread,

@@ -175,18 +175,22 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
     Bilinear between the sites, plus waves and the bending of the stage in that view.
     """
     artifact = truth.artifact
-    (hx, hy), (nx, ny) = artifact.half, artifact.shape
     place, g = position / artifact.grid_pitch_m, truth.g
     if len(truth.waves.number):
         sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
         g = g - truth.waves.at(sites).reshape(g.shape)
-    u, v = place + np.array([[hx], [hy]])
+    error = between_sites(artifact, g, position) + stage_bending(truth, position, index)
+    return error + truth.waves.at(place) if len(truth.waves.number) else error
+
+
+def between_sites(artifact: Artifact, values: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return values at the sites (..., nx, ny) at positions (2, E), m, bilinear, (..., E)."""
+    (hx, hy), (nx, ny) = artifact.half, artifact.shape
+    u, v = position / artifact.grid_pitch_m + np.array([[hx], [hy]])
     i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
     u, v = u - i, v - j
-    error = ((1 - u) * ((1 - v) * g[:, i, j] + v * g[:, i, j + 1])
-             + u * ((1 - v) * g[:, i + 1, j] + v * g[:, i + 1, j + 1])
-             + stage_bending(truth, position, index))
-    return error + truth.waves.at(place) if len(truth.waves.number) else error
+    return ((1 - u) * ((1 - v) * values[..., i, j] + v * values[..., i, j + 1])
+            + u * ((1 - v) * values[..., i + 1, j] + v * values[..., i + 1, j + 1]))
 
 
 def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray | float:
@@ -226,6 +230,32 @@ def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarra
         True position of the stage, of the same shape.
     """
     return place + stage if sense is Sense.PLATE_MOVES else place - stage
+
+
+def offset_seen(truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndarray,
+                place: np.ndarray) -> np.ndarray:
+    """Return the published offsets of marks, (2, E), m, without noise.
+
+    The stage, whatever it carries, is rotated about the optical axis where it is: its error is that
+    of the mark there.
+
+    Parameters
+    ----------
+    truth, sense
+        The truth; what the stage carries.
+    position, stage : float arrays (2, E)
+        Indicated and true position of the stage, m.
+    place : float array (2, E)
+        Positions of the marks with the stage at 0, m.
+    """
+    offset = true_offset(sense, place, stage)
+    if truth.yaw.size:
+        turn = between_sites(truth.artifact, truth.yaw, position)
+        turn = turn if sense is Sense.PLATE_MOVES else -turn  # the microscope instead
+        cosine, sine = np.cos(turn), np.sin(turn)
+        offset = np.stack([cosine * offset[0] - sine * offset[1],
+                           sine * offset[0] + cosine * offset[1]])
+    return seen_offset(truth, offset)
 
 
 def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:

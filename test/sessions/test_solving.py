@@ -32,7 +32,7 @@ from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
-ASSUMED = [term.name for term in DEFAULT_TERMS]
+ASSUMED = [term.name for term in DEFAULT_TERMS if term.name != "yaw"]  # which images show
 
 
 def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:

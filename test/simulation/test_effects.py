@@ -15,6 +15,7 @@ import pytest
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import AXES, Spread, random_truth
 from test.simulation.test_physics import (
@@ -108,6 +109,26 @@ def test_a_stage_bends_where_it_stands_whatever_lies_on_it():
         carried = measured(truth, Sense.PLATE_MOVES, view=view)
         assert deviation(carried, *mark) == pytest.approx([-3 * UM, -24 * UM])
     assert deviation(measured(truth), 1, 0) == pytest.approx([1 * UM, 8 * UM])
+
+
+def test_a_stage_turns_what_it_carries():
+    """Counter-clockwise: the image the other way, or the plate below it."""
+    truth = truth_with(yaw=np.full(PLATE.shape, 1e-3))
+    here, arm = np.zeros((2, 1)), np.array([[2e-4], [0.0]])
+    for sense, y in ((Sense.MICROSCOPE_MOVES, -2e-7), (Sense.PLATE_MOVES, 2e-7)):
+        seen = physics.offset_seen(truth, sense, here, here, arm)
+        np.testing.assert_allclose(seen[:, 0], [2e-4 * np.cos(1e-3), y], rtol=1e-6)
+
+
+def test_it_turns_as_at_its_place():
+    yaw = np.zeros(PLATE.shape)
+    yaw[PLATE.half[0] + 1, PLATE.half[1]] = 1e-3
+    truth, pitch = truth_with(yaw=yaw), PLATE.grid_pitch_m
+    arm = np.array([[0.0], [2e-4]])
+    for x, part in ((pitch, 1.0), (0.5 * pitch, 0.5), (-pitch, 0.0)):
+        seen = physics.offset_seen(truth, Sense.PLATE_MOVES, np.array([[x], [0.0]]),
+                                   np.zeros((2, 1)), arm)
+        assert seen[0, 0] == pytest.approx(-2e-7 * part, rel=1e-6, abs=1e-15)
 
 
 def test_each_view_has_its_own_bend():

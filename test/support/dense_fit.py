@@ -91,8 +91,9 @@ class DenseFit:
             elif term.name is TermName.ROTATION:
                 both = [v for v in lines if v in grid]
                 mine = [(v, "turn") for v in both[int(term.free):] if len(both) > 1]
-            else:
-                mine = [(v, part) for v in grid[int(term.free):] for part in MARKS[term.name]]
+            else:  # a yaw has columns with images only
+                mine = [(v, part) for v in grid[int(term.free):]
+                        for part in MARKS.get(term.name, ())]
             for v, part in mine:
                 if term.size_of(part):
                     keys.append((term.name, v, part))

@@ -150,8 +150,7 @@ class SolverSettings(ManagedSettings):
         "state it; 0 = known exactly", "m/m", 0.0, 1.0)
     rotation_u: float = declared(
         0.01, "standard uncertainty of the microscope's rotation relative to the axes, likewise",
-        "rad",
-        0.0, 1.0)
+        "rad", 0.0, 1.0)
     shear_u: float = declared(
         0.002, "standard uncertainty of half the difference of the microscope's scales, and of "
         "half its error of squareness, likewise", "m/m", 0.0, 1.0)
@@ -317,9 +316,10 @@ class SimulatorSettings(Settings):
         0.01, "time in which this falls to 1/e at rest", "s", 1e-6, 3600.0)
     stage_bend: float = declared(
         0.0, "bending of the stage in each view, at mid-edge, standard deviation", **_LENGTH)
+    stage_yaw: float = declared(
+        0.0, "rotation of the stage from site to site, standard deviation", **_ANGLE)
     plate_scale: float = declared(
-        0.0, "growth of the plate in each view after the first, standard deviation", "m/m", 0.0,
-        0.1)
+        0.0, "growth of the plate in views after the first, standard deviation", "m/m", 0.0, 0.1)
     plate_shape: float = declared(
         0.0, "bending of the plate in each view after the first, at mid-edge, standard deviation",
         **_LENGTH)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's distortion from images that show several marks (method eq. 4.16).
+"""The camera's distortion and the stage's yaw from images of several marks (method eq. 4.16).
 
 The offset of each cell of the image holds the camera's error there. A polynomial through the cells
 straightens offsets between them; its degree is the smallest that the cells do not contradict.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,14 +13,20 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
+from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
+from selfcal_ros.estimation.terms.equations import score
+from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.terms import TermName
 
 LEVEL = 1e-3
 """Level of the test that a polynomial of a higher degree fits the cells better."""
 POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
 cubic ones look like linear ones in three cells."""
+
+UNREAD = 1e-6
+"""Size of a column, or of its part in a combination, that is none."""
 
 STEPS = 20
 """Steps from a published offset to the true one; each is shorter by the slope of the distortion."""
@@ -196,3 +203,61 @@ def _straight(view: ViewReadings, visits: GridVisits, camera: Camera,
     return replace(view, dx=view.dx - dx, dy=view.dy - dy, visits=replace(
         visits, dx=visits.dx - excess.real, dy=visits.dy - excess.imag,
         offset_x=visits.offset_x - excess.real, offset_y=visits.offset_y - excess.imag))
+
+
+@dataclass(frozen=True, eq=False)
+class YawMap:
+    """Rotation of the stage from place to place, relative to its mean over the nodes.
+
+    Attributes
+    ----------
+    place : complex array (nodes,)
+        Position of the stage, m.
+    yaw, u : float array (nodes,)
+        Rotation, counter-clockwise, of what the stage carries, and its standard uncertainty, rad.
+    p : float
+        Probability that a stage that does not turn shows as much.
+    """
+
+    place: np.ndarray
+    yaw: np.ndarray
+    u: np.ndarray
+    p: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form, ``yaw`` of ``camera`` in RESULT.json."""
+        return {"x": self.place.real.tolist(), "y": self.place.imag.tolist(),
+                "yaw": self.yaw.tolist(), "u_yaw": self.u.tolist(), "p": self.p}
+
+
+def yaw_of(model: ModelFit, sense: Sense) -> YawMap | None:
+    """Return the stage's yaw that a fit shows, whatever size it was given (method eq. 4.17).
+
+    None without images, or if they do not determine it up to its mean.
+    """
+    images, nodes = model.problem.images, model.problem.ground.yaw
+    if images is None or images.yaw is None or nodes is None or model.equations is None:
+        return None
+    free = replace(model.equations,
+                   columns=model.equations.columns.scaled(TermName.YAW, math.inf))
+    rows = free.rows([TermName.YAW]) & (free.norm > free.norm.max() * UNREAD)
+    seen = rows[free.rows([TermName.YAW])]
+    if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=UNREAD) > 1:
+        return None
+    noise, taken = model.found.xy, model.coefficients
+    now = score(free, model.found.both_residuals, squares(model.problem, model.found),
+                coefficients=taken)
+    inverse = free.inverse(noise.sigma)
+    values = taken + inverse @ (
+        free.unbiased_sums(now.total) - free.prior(noise.sigma) * taken)
+    centred = np.eye(int(rows.sum())) - 1 / rows.sum()
+    to_map = centred @ inverse[np.ix_(rows, rows)]
+    share = images.noises(model.found.residuals).share
+    covariance = to_map @ centred + share * images.added_covariance(
+        np.tensordot(to_map, images.yaw.residuals[seen], 1))
+    covariance *= noise.sigma**2
+    yaw, n = centred @ values[rows], len(centred) - 1
+    statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw
+    sign = -1 if sense is Sense.PLATE_MOVES else 1  # (1.6) and its rotations
+    return YawMap(sign * nodes.nodes[seen], sign * yaw, np.sqrt(np.diag(covariance)),
+                  float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))

@@ -4,7 +4,7 @@
 Vibration and noise of the encoders move all marks of an image together. Such noise looks like an
 error of the stage, so that residuals show only part of it. Both noises follow from two sums of
 squares of the residuals, of the readings and of the images' sums, and from what draws of either
-noise make of them.
+noise make of them, the yaw of the stage fitted to them as to the readings.
 """
 
 import math
@@ -15,6 +15,8 @@ import numpy as np
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
+from selfcal_ros.estimation.terms.equations import UNTOLD
+from selfcal_ros.estimation.terms.yaw import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
@@ -47,6 +49,38 @@ class TwoNoises:
 
 
 @dataclass(frozen=True, eq=False)
+class FittedYaw:
+    """The yaw of the stage fitted to what grid readings leave.
+
+    Attributes
+    ----------
+    weight : float array (views, nx, ny)
+        Weights of the readings.
+    residuals : complex array (p, views, nx, ny)
+        What the maps leave of the readings for a unit of each coefficient.
+    parameters : float array (p, 3 views)
+        The misalignments that they take up.
+    inverse : float array (p, p)
+        Pseudo-inverse of their information: covariance of the coefficients for unit noise.
+    rank : int
+        Number of combinations that the readings determine.
+    """
+
+    weight: np.ndarray
+    residuals: np.ndarray
+    parameters: np.ndarray
+    inverse: np.ndarray
+    rank: int
+
+    def freed(self, residual: np.ndarray,
+              parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals and misalignments of a fit without the yaw after one with it."""
+        right = np.einsum("pvij,vij->p", self.residuals.conj(), self.weight * residual).real
+        yaw = self.inverse @ right
+        return residual - np.tensordot(yaw, self.residuals, 1), parameters - yaw @ self.parameters
+
+
+@dataclass(frozen=True, eq=False)
 class ImageNoise:
     """Images behind the grid readings, and what noise leaves in their residuals.
 
@@ -64,6 +98,8 @@ class ImageNoise:
         that of images, and of both together less these.
     parameters : float array (draws, 2, 3 views)
         Misalignments for unit noise of marks and of images, as in `JointFit`, m.
+    yaw : FittedYaw, optional
+        Of the draws, if the model has it.
     """
 
     stop: np.ndarray
@@ -71,6 +107,7 @@ class ImageNoise:
     weight: np.ndarray
     drawn: np.ndarray
     parameters: np.ndarray
+    yaw: FittedYaw | None = None
 
     @property
     def marks(self) -> float:
@@ -108,15 +145,24 @@ class ImageNoise:
         rest : complex array (k, views, nx, ny)
             Sensitivities of k coordinates over the weights, see `added_variances`.
         """
-        one = np.sqrt(self.weight) * rest[:, self.read]
-        n_stops = int(self.stop.max()) + 1
-        together = np.zeros((len(rest), n_stops), dtype=complex)
-        np.add.at(together.T, self.stop, one.T)
+        one, together = self._each_and_together(rest)
         return (abs(together) ** 2).sum(axis=1) - (abs(one) ** 2).sum(axis=1)
+
+    def added_covariance(self, rest: np.ndarray) -> np.ndarray:
+        """Return the same of all pairs of coordinates, (k, k)."""
+        one, together = self._each_and_together(rest)
+        return (together @ together.conj().T - one @ one.conj().T).real
+
+    def _each_and_together(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return sensitivities to readings of unit noise, (k, n), and to images, (k, stops)."""
+        one = np.sqrt(self.weight) * rest[:, self.read]
+        together = np.zeros((len(rest), int(self.stop.max()) + 1), dtype=complex)
+        np.add.at(together.T, self.stop, one.T)
+        return one, together
 
 
 def image_noise(artifact: Artifact, views: Sequence[View],
-                system: NormalEquations) -> ImageNoise | None:
+                system: NormalEquations, yaw: StageYaw | None = None) -> ImageNoise | None:
     """Return the images behind grid readings; None without images, or for iterated fields.
 
     Parameters
@@ -127,30 +173,55 @@ def image_noise(artifact: Artifact, views: Sequence[View],
         All views of the measurement; sub-views of one view have images in common.
     system : NormalEquations
         The grid readings.
+    yaw : StageYaw, optional
+        The yaw of the stage, if the model has it.
     """
     mine = tuple(views[index] for index in system.grid_index)
     if not system.direct or not any(view.cell is not None for view in mine):
         return None
     key = tuple((view.plan_view, view.step_on_plate(artifact)) for view in mine)
-    return _known.get(system, key, lambda: _drawn(system, key))
+    size = None if yaw is None else (yaw.half_m, tuple(yaw.arms.tolist()))
+    return _known.get(system, (key, size), lambda: _drawn(system, key, yaw))
 
 
 _known: Memo[tuple, ImageNoise] = Memo()
 
 
-def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]]) -> ImageNoise:
+def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
+    grid = system.grid
+    left = []
+    for column in yaw.columns():
+        values = np.zeros(grid.read.shape, dtype=complex)
+        for view, of_marks in column.items():
+            values[view] = of_marks.reshape(values[view].shape)
+        left.append(_solved(system, values[grid.read]))
+    residuals, parameters = (np.array(part) for part in zip(*left, strict=True))
+    flat = residuals[:, grid.read]
+    gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
+    norm = np.abs(flat).max()
+    values, vectors = np.linalg.eigh(gram)
+    told = values > UNTOLD * norm**2 * len(flat.T)
+    inverse = (vectors[:, told] / values[told]) @ vectors[:, told].T
+    return FittedYaw(grid.weight, residuals, parameters, inverse, int(told.sum()))
+
+
+def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]],
+           yaw: StageYaw | None) -> ImageNoise:
     """Return images and draws of readings; `views` are the names in the plan and steps of cells."""
     grid = system.grid
     stops = _stops(views, grid.read)
     weight = grid.weight[grid.read]
     drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
-    plain = ImageNoise(stops, grid.read, weight, drawn, np.zeros((len(drawn), 2, 3 * len(views))))
+    fitted = None if yaw is None else _fitted_yaw(system, yaw)
+    plain = ImageNoise(stops, grid.read, weight, drawn,
+                       np.zeros((len(drawn), 2, 3 * len(views))), fitted)
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):
         mark, image = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (
             len(stops), stops.max() + 1))
-        left, parameters[:] = zip(*(_solved(system, values / np.sqrt(weight))
-                                    for values in (mark, image[stops])), strict=True)
+        solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
+        left, parameters[:] = zip(*(solved if fitted is None else [
+            fitted.freed(*one) for one in solved]), strict=True)
         row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
         row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
     return plain

@@ -159,9 +159,12 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     grid = problem.system.grid
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    alone = sigma_of(total, grid_dof(problem))
-    found = alone if problem.residuals_xy is None else problem.residuals_xy
+    alone = found = sigma_of(total, grid_dof(problem))
     repeats = problem.repeats_xy
+    if problem.residuals_xy is not None:
+        found = problem.residuals_xy
+        if problem.images is not None and problem.images.yaw is not None:
+            alone = sigma_of(total, grid_dof(problem) - problem.images.yaw.rank)
     if problem.images is not None and total > 0:  # of which residuals show only part
         noises = problem.images.noises(residual)
         found = found[0] * noises.sigma / alone[0], min(noises.dof, found[1])

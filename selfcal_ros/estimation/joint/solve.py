@@ -70,7 +70,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.terms import OF_LINES, VISIT_TERMS, TermName
+from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import LatticePose, Plan
 
@@ -148,14 +148,14 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     terms = tuple(
         term for term in options.model_terms(
             visits=all(v is not None for v in ground.visits), assumed=direct and rigid)
-        if term.name not in OF_LINES or (
-            ground.with_lines if term.name is TermName.ROTATION else angular.index))
+        if ground.has(term.name))
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
         ground, options.reference, rigid, terms, options.drift_degree,
         places=places_of(measurements, grid, ground, system.known_sites),
         at_places=options.at_places,
-        images=image_noise(measurements.artifact, [v.view for v in measurements.views], system))
+        images=image_noise(measurements.artifact, [v.view for v in measurements.views], system,
+                           ground.yaw if TermName.YAW in [term.name for term in terms] else None))
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
 

@@ -22,8 +22,8 @@ from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
-from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
-from selfcal_ros.estimation.terms.shapes import shapes_of
+from selfcal_ros.estimation.terms.columns import Column, TermColumns
+from selfcal_ros.estimation.terms.shapes import WithinMarks, shapes_of
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.causes import cause_of
 from selfcal_ros.estimation.verdict.explanations import find_explanations

@@ -12,6 +12,7 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
     approach     V has +-(h_x s_x + i h_y s_y)  2, shared; minus where the plate moves
     line_eccentricity  Vtheta has c cos theta_k + s sin theta_k, 2 a view, rad
     rotation     Vtheta has r, 1 a view of marks and lines, rad
+    yaw          V has -i yaw d at d in the image, 1 a node, shared
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,11 +22,18 @@ import numpy as np
 from scipy.special import eval_legendre
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.terms.shapes import NO_LINES, LineColumns, Shapes, shapes_of
+from selfcal_ros.estimation.terms.shapes import (
+    NO_LINES,
+    AtVisits,
+    LineColumns,
+    Shapes,
+    WithinMarks,
+    shapes_of,
+    within_anew,
+    within_marks,
+)
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, squares_within
 from selfcal_ros.model.terms import OF_LINES, UNITS, VISIT_TERMS, ModelTerm, TermName
-
-AtVisits = list[list[np.ndarray | None]]
 
 AXES: tuple[tuple[str, complex], ...] = (("x", 1), ("y", 1j))
 """Along x and along y: what a column multiplies its shape by."""
@@ -44,28 +52,6 @@ class Column:
     def unit(self) -> str:
         """SI unit of the coefficient."""
         return UNITS.get(self.term, "m")
-
-
-@dataclass(frozen=True, eq=False)
-class WithinMarks:
-    """What the visits of each mark tell about the coefficients, and leave: see `visits`.
-
-    Attributes
-    ----------
-    gram : float array (p, p)
-        Weighted inner products of the columns about the means of their marks.
-    right : float array (p,)
-        The same with the deviations, m times the column's unit.
-    total : float
-        Weighted sum of squares of the deviations about the means of their marks, m^2.
-    dof : int
-        Its degrees of freedom.
-    """
-
-    gram: np.ndarray
-    right: np.ndarray
-    total: float
-    dof: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +146,8 @@ class ColumnBuilder:
         """Return the columns."""
         shapes = shapes_of(self.means, self.of_column, self.unit, ground.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
-        return TermColumns(tuple(self.columns), shapes, _within(ground, self.at, shapes), self.at,
+        within = within_marks(ground.visits, self.at, shapes)
+        return TermColumns(tuple(self.columns), shapes, within, self.at,
                            LineColumns(np.array(at), np.stack(values)) if at else NO_LINES)
 
 
@@ -187,6 +174,8 @@ def term_columns(ground: TermInputs, terms: Iterable[ModelTerm], degree: int) ->
             _require_visits(ground, term.name)
         if term.name in OF_LINES:
             _line_columns(made, ground, term)
+        elif term.name is TermName.YAW:
+            _yaw_columns(made, ground, term)
         elif term.name not in VISIT_TERMS:
             _plate_columns(made, ground, term)
         elif term.name is TermName.DRIFT:
@@ -223,8 +212,8 @@ def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *
     shapes = before.shapes.replaced(list(own.values()), [fresh.means[shape] for shape in own])
     changed = np.arange(shapes.n) if moved else np.array(sorted(own.values()), dtype=int)
     total = squares_within(ground.visits) if moved else before.within.total
-    within = _within_anew(ground, at, shapes, before=replace(before.within, total=total),
-                          changed=changed)
+    within = within_anew(ground.visits, at, shapes, before=replace(before.within, total=total),
+                         changed=changed)
     return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
@@ -261,8 +250,8 @@ def joined(ground: TermInputs, first: TermColumns, second: TermColumns) -> TermC
     """Return the columns of both."""
     at = [*first.at, *second.at]
     shapes = first.shapes.with_others(second.shapes)
-    return TermColumns((*first.columns, *second.columns), shapes, _within(ground, at, shapes), at,
-                       first.lines)
+    return TermColumns((*first.columns, *second.columns), shapes,
+                       within_marks(ground.visits, at, shapes), at, first.lines)
 
 
 def _require_visits(ground: TermInputs, name: TermName) -> None:
@@ -316,6 +305,19 @@ def _values(ground: TermInputs, name: TermName, visits: ViewVisits) -> np.ndarra
     return ground.indicated * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
 
 
+def _yaw_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
+    """Add the columns of the stage's yaw: the same at all visits of a mark."""
+    if ground.yaw is None:
+        return
+    phases = [nominal if view is None else view.phase
+              for view, nominal in zip(ground.visits, ground.yaw.phases, strict=True)]
+    here = ground.weight.reshape(len(phases), -1) > 0
+    for node, means in enumerate(ground.yaw.columns(phases)):
+        shape = made.add({view: values * here[view] for view, values in means.items()},
+                         [None] * len(phases))
+        made.column(Column(term.name, -1, f"node {node}", term.size), shape, 1)
+
+
 def _plate_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
     """Add the columns of plate scale or shape: the same at all visits of a mark.
 
@@ -366,34 +368,3 @@ def _line_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> N
             values[view] = wave
             made.lines.append((len(made.columns), values))
             made.column(Column(term.name, view, component, term.size), made.add({}, nothing), 1)
-
-
-def _within(ground: TermInputs, at: AtVisits, shapes: Shapes) -> WithinMarks:
-    n = len(shapes.unit)
-    dof = sum(2 * (len(visits.mark) - len(np.unique(visits.mark)))
-              for visits in ground.visits if visits is not None and visits.repeated)
-    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), squares_within(ground.visits), dof)
-    return _within_anew(ground, at, shapes, before=nothing, changed=np.arange(shapes.n))
-
-
-def _within_anew(ground: TermInputs, at: AtVisits, shapes: Shapes, *, before: WithinMarks,
-                 changed: np.ndarray) -> WithinMarks:
-    """Return what the means hide, the products of the shapes `changed` set up anew."""
-    inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
-    against: np.ndarray = np.zeros(shapes.n, dtype=complex)
-    for view, visits in enumerate(ground.visits):
-        mine = [k for k in changed if at[k][view] is not None]
-        if visits is None or not (visits.repeated and mine):
-            continue
-        here = [k for k in range(shapes.n) if at[k][view] is not None]
-        # about the means of their marks: then those of the others drop out
-        moved = visits.about_means(np.array([at[k][view] for k in mine]), ground.z.size)
-        weighted = np.conj(moved) * visits.weight
-        inner[np.ix_(mine, here)] += weighted @ np.array([at[k][view] for k in here]).T
-        against[mine] += (weighted @ visits.y).conj()
-    gram, right, own = before.gram.copy(), before.right.copy(), np.isin(shapes.of_column, changed)
-    gram[own], right[own] = shapes.products(inner)[own], shapes.against(against)[own]
-    gram[:, own] = gram[own].T
-    square = gram[np.ix_(own, own)]
-    gram[np.ix_(own, own)] = (square + square.T) / 2
-    return WithinMarks(gram, right, before.total, before.dof)

@@ -14,12 +14,7 @@ from scipy.special import ndtri
 
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.terms.columns import (
-    Column,
-    TermColumns,
-    WithinMarks,
-    term_columns,
-)
+from selfcal_ros.estimation.terms.columns import Column, TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
@@ -27,7 +22,9 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_columns,
     reduce_lines,
 )
+from selfcal_ros.estimation.terms.shapes import WithinMarks
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, placings_of
+from selfcal_ros.estimation.terms.yaw import stage_yaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
@@ -109,7 +106,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                   system.grid.weight, visits, tuple(view.name for view in grid_views),
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
-                  placing_names=tuple(view.plan_view for view in grid_views))
+                  placing_names=tuple(view.plan_view for view in grid_views),
+                  yaw=stage_yaw(artifact, grid_views))
 
 
 def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,

@@ -15,6 +15,10 @@ from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.estimation.terms.visits import ViewVisits, squares_within
+
+AtVisits = list[list[np.ndarray | None]]
+
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
@@ -168,3 +172,68 @@ def shapes_in_full(columns: np.ndarray) -> Shapes:
     return Shapes(p, columns.shape[2:], (every,) * views,
                   tuple(columns[:, view].reshape(p, -1) for view in range(views)),
                   every, np.ones(p, dtype=complex))
+
+
+@dataclass(frozen=True, eq=False)
+class WithinMarks:
+    """What the visits of each mark tell about the coefficients, and leave: see `visits`.
+
+    Attributes
+    ----------
+    gram : float array (p, p)
+        Weighted inner products of the columns about the means of their marks.
+    right : float array (p,)
+        The same with the deviations, m times the column's unit.
+    total : float
+        Weighted sum of squares of the deviations about the means of their marks, m^2.
+    dof : int
+        Its degrees of freedom.
+    """
+
+    gram: np.ndarray
+    right: np.ndarray
+    total: float
+    dof: int
+
+
+def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes) -> WithinMarks:
+    """Return what the means of the marks hide.
+
+    Parameters
+    ----------
+    visits : sequence of ViewVisits or None
+        Visits of each view.
+    at : list
+        Values of each shape at the visits, as in `TermColumns`.
+    shapes : Shapes
+        Those at the means, and the columns.
+    """
+    n = len(shapes.unit)
+    dof = sum(2 * (len(view.mark) - len(np.unique(view.mark)))
+              for view in visits if view is not None and view.repeated)
+    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), squares_within(visits), dof)
+    return within_anew(visits, at, shapes, before=nothing, changed=np.arange(shapes.n))
+
+
+def within_anew(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes, *,
+                before: WithinMarks, changed: np.ndarray) -> WithinMarks:
+    """Return what the means hide, the products of the shapes `changed` set up anew."""
+    n_marks = shapes.lattice[0] * shapes.lattice[1]
+    inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
+    against: np.ndarray = np.zeros(shapes.n, dtype=complex)
+    for view, seen in enumerate(visits):
+        mine = [k for k in changed if at[k][view] is not None]
+        if seen is None or not (seen.repeated and mine):
+            continue
+        here = [k for k in range(shapes.n) if at[k][view] is not None]
+        # about the means of their marks: then those of the others drop out
+        moved = seen.about_means(np.array([at[k][view] for k in mine]), n_marks)
+        weighted = np.conj(moved) * seen.weight
+        inner[np.ix_(mine, here)] += weighted @ np.array([at[k][view] for k in here]).T
+        against[mine] += (weighted @ seen.y).conj()
+    gram, right, own = before.gram.copy(), before.right.copy(), np.isin(shapes.of_column, changed)
+    gram[own], right[own] = shapes.products(inner)[own], shapes.against(against)[own]
+    gram[:, own] = gram[own].T
+    square = gram[np.ix_(own, own)]
+    gram[np.ix_(own, own)] = (square + square.T) / 2
+    return WithinMarks(gram, right, before.total, before.dof)

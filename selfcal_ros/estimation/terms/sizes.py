@@ -181,6 +181,7 @@ CURES = {
     TermName.PLATE_STRAIN: "add views shifted both ways along both axes",
     TermName.LINE_ECCENTRICITY: "centre the circle of lines better",
     TermName.ROTATION: "read lines in more views with marks",
+    TermName.YAW: "let images show more marks, along x and along y",
     TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
 }
 """Remedies that make a term separable, in words."""

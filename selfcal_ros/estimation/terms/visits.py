@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
+from selfcal_ros.estimation.terms.yaw import StageYaw, stage_yaw
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
 from selfcal_ros.model.view import View
@@ -233,6 +234,8 @@ class TermInputs:
         see one plate, bent and drifting alike. Empty: each view is a placing.
     placing_names : tuple of str
         Names of the placings of the views.
+    yaw : StageYaw, optional
+        How images depend on the yaw of the stage; None without images.
     """
 
     z: np.ndarray
@@ -246,6 +249,7 @@ class TermInputs:
     with_lines: tuple[int, ...] = ()
     placings: tuple[int, ...] = ()
     placing_names: tuple[str, ...] = ()
+    yaw: StageYaw | None = None
 
     @property
     def members(self) -> dict[int, list[int]]:
@@ -261,6 +265,13 @@ class TermInputs:
             return self.line_names
         of_placing = term in OF_PLATE or term == TermName.DRIFT
         return self.placing_names if of_placing and self.placing_names else self.names
+
+    def has(self, term: TermName) -> bool:
+        """Return whether any reading can depend on a term."""
+        if term is TermName.YAW:
+            return self.yaw is not None
+        return term not in OF_LINES or bool(
+            self.with_lines if term is TermName.ROTATION else self.line_names)
 
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
@@ -285,7 +296,8 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
                       tuple(view.name for view in views), approach_sign(measurements.sense),
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
-                      tuple(view.plan_view for view in views))
+                      tuple(view.plan_view for view in views),
+                      stage_yaw(measurements.artifact, views))
 
 
 def without_noise(ground: TermInputs, residuals: np.ndarray,

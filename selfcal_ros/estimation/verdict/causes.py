@@ -206,6 +206,11 @@ def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
     return value, u, {"view": names[found.columns[at].view]}
 
 
+def _yaw(found: Explanation, *_: object) -> Sized:
+    value, u = _one_column(found)[1:]
+    return abs(value), u, {}
+
+
 def _approach(found: Explanation, *_: object) -> Sized:
     axis, value, u = _one_column(found)
     return value, u, {"axis": axis}
@@ -233,7 +238,8 @@ _SIZES: dict[str, Callable[..., Sized]] = {
     TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _of_plate,
     TermName.PLATE_SHAPE: _of_plate, TermName.APPROACH: _approach, SLIP: _slip,
     READING: _reading, TermName.PLATE_STRAIN: _of_plate,
-    TermName.LINE_ECCENTRICITY: _line_eccentricity, TermName.ROTATION: _rotation}
+    TermName.LINE_ECCENTRICITY: _line_eccentricity, TermName.ROTATION: _rotation,
+    TermName.YAW: _yaw}
 
 
 def turned_too_far(model: ModelFit, result: CalibrationResult,

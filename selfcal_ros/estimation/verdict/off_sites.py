@@ -19,10 +19,9 @@ from selfcal_ros.estimation.terms.columns import (
     AXES,
     Column,
     TermColumns,
-    WithinMarks,
     columns_from,
 )
-from selfcal_ros.estimation.terms.shapes import shapes_of
+from selfcal_ros.estimation.terms.shapes import WithinMarks, shapes_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.verdict import Cause

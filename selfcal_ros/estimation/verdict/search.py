@@ -63,7 +63,8 @@ MAX_JOINED = 4
 START: dict[str, float] = {
     TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
     TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
-    TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10}
+    TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10,
+    TermName.YAW: 1e-9}
 """Initial size of a term that joins: so small that the readings contradict it."""
 
 PLAUSIBLE = {TermName.MICROSCOPE: 0.1}

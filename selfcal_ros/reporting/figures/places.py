@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of places: the plate in every view, rejected readings, the camera's errors."""
+"""Figures of places: the plate in every view, rejected readings, the camera's errors, the yaw."""
 
 import math
 from collections import Counter
@@ -16,9 +16,10 @@ from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
 from selfcal_ros.reporting.figures.residuals import places_mm
-from selfcal_ros.reporting.summary.numbers import cells_of, printable, significant
+from selfcal_ros.reporting.summary.camera import cells_of, yaw_of
+from selfcal_ros.reporting.summary.numbers import printable, significant
 from selfcal_ros.reporting.summary.sections import pose_text
-from selfcal_ros.units import MM_PER_M, UM_PER_M
+from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 
 
 def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
@@ -211,4 +212,33 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     parts.arrow_key(frame, factor, (LEFT, TOP + SIDE + 58))
     drawing.label(LEFT + 130, TOP + SIDE + 62, f"vectors enlarged {factor:,.0f} ×")
     drawing.height = TOP + SIDE + 76
+    return drawing
+
+
+def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
+    """Return the yaw of the stage at its nodes in colour; None without images."""
+    nodes = yaw_of(result)
+    if not nodes.size:
+        return None
+    place, (yaw, u) = nodes[:2] * MM_PER_M, nodes[2:] * URAD_PER_RAD
+    half = [np.diff(np.unique(along)).min(initial=np.inf) / 2 for along in place]
+    dx, dy = (side if np.isfinite(side) else min(half) for side in half)
+    x, y = (float(np.abs(along).max()) + side for along, side in zip(place, (dx, dy), strict=True))
+    drawing = parts.titled("yaw", "Yaw of the stage about its mean, counter-clockwise")
+    width, height = (SIDE, SIDE * y / x) if y < x else (SIDE * x / y, SIDE)
+    frame = draw.Frame(drawing, (LEFT, TOP, width, height), (-x, x), (-y, y))
+    scale = parts.Scale("d", -(end := parts.round_end(yaw)), end)
+    levels = parts.levels(yaw, scale)
+    for level in np.unique(levels).tolist():
+        drawing.shapes([tuple(frame.at(a + i * dx, b + j * dy) for i, j in (
+            (-1, -1), (1, -1), (1, 1), (-1, 1))) for a, b in place[:, levels == level].T],
+            fill=f"d{level}")
+    frame.axes(x_label="stage x in mm", y_label="stage y in mm")
+    parts.scale_bar(drawing, scale, (LEFT + width + 16, TOP, 14.0, height), "µrad")
+    k = result.noise.k_xy
+    for (a, b), value, spread in zip(place.T, yaw, u * k, strict=True):
+        drawing.spot(*frame.at(a, b), 0.9 * min(dx * frame.per_x, dy * frame.per_y),
+                     f"x {a:.4g} mm, y {b:.4g} mm: {significant(value)} ± {significant(spread)} "
+                     f"µrad (k = {k:.3g})")
+    drawing.height = TOP + height + 46
     return drawing

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Key figures of a map, of its comparison with a known truth, and of the camera; their format."""
+"""Key figures of a map, and of its comparison with a known truth; their format."""
 
 import math
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 UNKNOWN = "–"
 _NUMBER = re.compile(r"[−+-]?\d[\d.]*(e[+-]?\d+)?|–|many")
@@ -330,47 +330,3 @@ def _truth_array(truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ..
         raise InputError(f"truth {key}", f"has the shape {array.shape}, the map has {shape}",
                          "give the truth on the lattice of the map")
     return array
-
-
-COLUMNS = ("x", "y", "dx", "dy", "u_dx", "u_dy")
-NUMBERS = ("scale", "rotation", "stretch", "shear", "u_scale", "u_rotation", "u_stretch", "u_shear",
-           "degree", "noise_image", "noise_mark")
-PERCENT = 100
-
-
-def cells_of(result: CalibrationResult) -> np.ndarray:
-    """Return places, errors and their u at the cells of images, (6, cells), m; empty without."""
-    camera: Any = result.extra.get("camera")
-    try:
-        cells = np.array([[float(cell[name]) for name in COLUMNS] for cell in camera["cells"]]).T
-        known = all(isinstance(camera[name], int | float) for name in NUMBERS)
-    except (KeyError, TypeError, ValueError):
-        return np.zeros((len(COLUMNS), 0))
-    good = known and cells.size and np.isfinite(cells).all()
-    return cells if good else np.zeros((len(COLUMNS), 0))
-
-
-def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
-    """Return what images tell of the camera, published minus true offset; empty without images."""
-    cells = cells_of(result)
-    if not cells.size:
-        return ()
-    camera: dict[str, Any] = result.extra["camera"]
-
-    def told(name: str, scale: float, unit: str) -> str:
-        value, u = (significant(camera[key] * scale) for key in (name, f"u_{name}"))
-        return f"{value} ± {u} {unit} (k=1)"
-
-    worst = int(np.argmax(np.hypot(*cells[2:4])))
-    x, y = cells[:2, worst] * MM_PER_M
-    size, u = math.hypot(*cells[2:4, worst]), math.hypot(*cells[4:6, worst]) / math.sqrt(2)
-    parts = [name for name, power in (("quadratic", [2, 0]), ("radial (cubic)", [2, 1]))
-             if power in [c.get("power") for c in camera.get("coefficients", [])]]
-    return (("scale", told("scale", PERCENT, "%") + ", offsets published too long where positive"),
-            ("rotation", told("rotation", MRAD_PER_RAD, "mrad")),
-            ("stretch, shear", f"{told('stretch', PERCENT, '%')}, {told('shear', PERCENT, '%')}"),
-            ("distortion", " and ".join(parts) or "none shown"),
-            ("largest error", f"{significant(size * UM_PER_M)} ± {significant(u * UM_PER_M)} µm at "
-                              f"x {x:.4g} mm, y {y:.4g} mm of the image"),
-            ("noise", f"{significant(camera['noise_image'] * UM_PER_M)} µm of an image, "
-                      f"{significant(camera['noise_mark'] * UM_PER_M)} µm of a mark in it"))

@@ -12,14 +12,15 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     MapFigures,
     aligned,
     aligned_numbers,
     arcsec,
-    camera_facts,
     counted,
     decimals_for,
     fixed,
@@ -83,8 +84,8 @@ def terms_section(result: CalibrationResult) -> Section:
     """Return the estimates of the terms of the model."""
     rows = []
     for term in result.model.terms:
-        if term.source == "default" and term.size_used is None:
-            continue  # a line of the budget
+        if term.name == TermName.YAW or (term.source == "default" and term.size_used is None):
+            continue  # part of the camera, or a line of the budget
         how = "free" if term.size is None else f"size {term.size:g}"
         if term.size_used is not None:
             how += f", contradicted: {term.size_used:.2g} used"

@@ -45,7 +45,7 @@ def unit_of(name: str, si: str) -> Unit:
 
     Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
     """
-    if name in (TermName.LINE_ECCENTRICITY, TermName.ROTATION):
+    if name in (TermName.LINE_ECCENTRICITY, TermName.ROTATION, TermName.YAW):
         return URAD
     return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, Unit(1.0, si))
 
@@ -116,6 +116,7 @@ _CAUSES: dict[str, Words] = {
     TermName.LINE_ECCENTRICITY: lambda c, of: (
         f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
         f"view '{c.view}'"),
+    TermName.YAW: lambda c, of: f"a stage that turns by up to {plus_minus(c, URAD)} on its way",
     TermName.APPROACH: lambda c, of: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"),
@@ -147,6 +148,7 @@ _ACTIONS = {
     TermName.PLATE_SHAPE: "support the plate without strain",
     TermName.PLATE_STRAIN: "support the plate without strain",
     TermName.LINE_ECCENTRICITY: "centre the circle of lines on the axis of rotation in each view",
+    TermName.YAW: "declare a larger yaw:SIZE",
     TermName.APPROACH: "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
     TermName.ROTATION: "check whether the plate moved between marks and lines, and the sign of "

@@ -124,7 +124,8 @@ def dof_text(dof: float) -> str:
 _CERTIFICATES: dict[str, str] = {
     TermName.MICROSCOPE: "declare the microscope (--microscope), from a certificate of its scale",
     TermName.PLATE_STRAIN: "declare a smaller plate_strain:SIZE, from support and temperature",
-    TermName.LINE_ECCENTRICITY: "declare a smaller line_eccentricity:SIZE, from a certificate"}
+    TermName.LINE_ECCENTRICITY: "declare a smaller line_eccentricity:SIZE, from a certificate",
+    TermName.YAW: "declare a smaller yaw:SIZE, from a measurement of the stage's angles"}
 """What removes a line of a plan's budget that no change of the plan removes."""
 
 

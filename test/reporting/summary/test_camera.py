@@ -10,9 +10,10 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
-from selfcal_ros.reporting.figures.places import camera_errors
-from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of
-from selfcal_ros.reporting.summary.sections import summary_text
+from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw
+from selfcal_ros.reporting.summary.camera import camera_facts, cells_of, yaw_facts
+from selfcal_ros.reporting.summary.numbers import significant
+from selfcal_ros.reporting.summary.sections import summary_text, terms_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.plans import image_plan
@@ -37,17 +38,50 @@ def test_the_summary_states_the_camera():
     assert facts["distortion"] == "radial (cubic)"
     assert facts["largest error"].endswith("mm of the image")
     assert "Camera" in summary_text(result())
-    assert "scale           -0.39" in summary_text(result())
+    words = {line.split("  ")[1]: line for line in summary_text(result()).splitlines()
+             if line.startswith("  ")}
+    assert "-0.39" in words["scale"]
+
+
+def test_the_summary_states_the_yaw_of_the_stage():
+    yaw = result().extra["camera"]["yaw"]
+    (fact,) = yaw_facts(result())
+    assert fact in camera_facts(result())
+    assert fact[1].startswith(
+        f"{significant(min(yaw['yaw']) * 1e6)} to {significant(max(yaw['yaw']) * 1e6)} ± ")
+    assert "not more than its noise" in fact[1]
+    turning = replace(result(), extra={"camera": {"yaw": yaw | {"p": 1e-5}}})
+    assert yaw_facts(turning)[0][1].endswith("mean; p = 1e-05")
+    assert camera_facts(turning) == yaw_facts(turning)
+    assert [row for row in terms_section(result()).table if "yaw" in row[0]] == []
 
 
 def test_the_report_draws_its_errors():
     (chapter,) = [c for c in chapters(result(), None) if c.title == "Camera"]
-    assert len(chapter.figures) == 1
+    assert [figure.drawing.name for figure in chapter.figures] == ["camera", "yaw"]
     drawing = camera_errors(result())
     spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
     assert len(spots) == 9
     dx = result().extra["camera"]["cells"][0]["dx"]
     assert f"{dx * 1e6:.1f} ±" in spots[0].title
+
+
+def test_the_report_draws_the_yaw():
+    drawing, yaw = stage_yaw(result()), result().extra["camera"]["yaw"]
+    spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
+    assert len(spots) == 25
+    assert spots[7].title.startswith(f"x {yaw['x'][7] * 1e3:.4g} mm, y {yaw['y'][7] * 1e3:.4g} mm")
+    assert f": {significant(yaw['yaw'][7] * 1e6)} ±" in spots[7].title
+    fills = [item.fill for item in drawing.items if getattr(item, "fill", "").startswith("d")]
+    assert len(fills) > 5
+
+
+@pytest.mark.parametrize("yaw", [None, [], {"x": [1.0]}, {
+    "x": [1.0], "y": [1.0], "yaw": [float("nan")], "u_yaw": [1.0], "p": 0.5}])
+def test_without_a_yaw_none_is_shown(yaw):
+    other = replace(result(), extra={"camera": {"yaw": yaw}})
+    assert yaw_facts(other) == ()
+    assert stage_yaw(other) is None
 
 
 @pytest.mark.parametrize("camera", [None, {}, {"cells": []}, {"cells": [{"x": 1}]}, [1], {

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The yaw of the stage from images: against dense linear algebra, known truth, and its signs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.camera import yaw_of
+from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.physics import between_sites
+from test.estimation.joint.test_images import MARK, datum, dense, measured, population, within
+from test.support.plans import image_plan
+from test.support.truth import Spread, random_truth, simulate_measurements
+
+PITCH = 1e-3
+
+
+def of_yaw(measurements):
+    """Return the columns of a yaw at each site, rows as in `dense`."""
+    (nx, ny), (hx, hy) = measurements.artifact.shape, measurements.artifact.half
+    rows, place = np.zeros((2 * sum(len(v.m) for v in measurements.views), nx * ny)), 0
+    for view in measurements.views:
+        turned = round(view.view.rotation_rad / (np.pi / 2))
+        # the plate, with all its marks, lies shifted by minus the place of the cell
+        dx, dy = (-round(t / PITCH) * PITCH for t in view.view.translation_m)
+        for m, n in zip(view.m, view.n, strict=True):
+            x, y = ((m, n), (-n, m))[turned]
+            site = round((x - dx / PITCH + hx) * ny + y - dy / PITCH + hy)
+            rows[place, site], rows[place + 1, site] = dy, -dx  # -i (dx + i dy)
+            place += 2
+    return rows
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.06])
+def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
+    _, measurements = measured(3 * MARK, 5, missing=missing, size=5, rotation="linear",
+                               phi_rad=1e-5, stage_yaw_rad=2e-5)
+    solved = solve_joint(measurements, Options(
+        assumed=(), terms=(ModelTerm(TermName.YAW),), misalignment_model="linear",
+        at_places=False))
+    matrix, stops = dense(measurements)
+    matrix = np.hstack([matrix, of_yaw(measurements) / PITCH])
+    inverse = np.linalg.pinv(matrix, rcond=1e-10)
+    y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
+    noises = solved.model.problem.images.noises(solved.model.found.residuals)
+    assert noises.image > 2 * noises.mark > 0
+    covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
+        stops[:, None] == stops, np.eye(2))
+    sites = np.prod(measurements.artifact.shape)
+    to_yaw = (np.eye(sites) - 1 / sites) @ inverse[-sites:] / PITCH
+    yaw = yaw_of(solved.model, measurements.sense)
+    np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=1e-8 * yaw.yaw.std())
+    np.testing.assert_allclose(yaw.u, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)), rtol=1e-6)
+    to_map = datum(measurements.artifact) @ inverse[:2 * sites]
+    emap = solved.result.error_map
+    g = np.stack([emap.gx, emap.gy], axis=-1).ravel()
+    np.testing.assert_allclose(g, to_map @ y, atol=1e-8 * g.std())
+    u = np.stack([emap.u_gx, emap.u_gy], axis=-1).ravel()
+    np.testing.assert_allclose(u, np.sqrt(np.diag(to_map @ covariance @ to_map.T)), rtol=1e-6)
+
+
+def test_only_a_constant_yaw_is_the_cameras():
+    """What is free beside the unknowns of the maps is one yaw for all sites."""
+    _, measurements = measured(0.0, 1, size=5)
+    alone = dense(measurements)[0]
+    both = np.hstack([alone, of_yaw(measurements) / PITCH])
+    values, vectors = np.linalg.eigh(both.T @ both)
+    free = vectors[-both.shape[1] + alone.shape[1]:, values < 1e-9 * values[-1]]
+    free = free[:, np.abs(free).max(axis=0) > 1e-9]
+    assert np.linalg.matrix_rank(free, tol=1e-6) == 1
+    assert np.ptp(free, axis=0).max() < 1e-9
+
+
+def turns(truth, camera) -> np.ndarray:
+    """Return (yaw - truth) / u at the nodes."""
+    yaw = {name: np.array(camera["yaw"][name]) for name in ("x", "y", "yaw", "u_yaw")}
+    true = between_sites(truth.artifact, truth.yaw, np.stack([yaw["x"], yaw["y"]]))
+    return (yaw["yaw"] - (true - true.mean())) / yaw["u_yaw"]
+
+
+@pytest.mark.parametrize(("size", "sense", "rad", "runs"), [
+    (7, Sense.MICROSCOPE_MOVES, 1e-5, 16), (7, Sense.PLATE_MOVES, 3e-5, 16),
+    (13, Sense.PLATE_MOVES, 2e-5, 3)])
+def test_yaw_and_map_of_a_stage_that_turns_are_within_their_uncertainties(size, sense, rad, runs):
+    away, results = population(MARK, size, runs, sense=sense, stage_yaw_rad=rad)
+    assert all(found.verdict.qualified and not found.verdict.causes for _, found in results)
+    within(away, 20)
+    within(np.array([turns(truth, found.extra["camera"]) for truth, found in results]), 20)
+
+
+def test_a_stage_that_does_not_turn_shows_none():
+    _, results = population(MARK, 5, 20, sense=Sense.MICROSCOPE_MOVES)
+    p = [found.extra["camera"]["yaw"]["p"] for _, found in results]
+    assert sum(each < 0.05 for each in p) <= 4
+    assert min(p) > 1e-3
+
+
+def test_left_out_of_the_model_it_is_named():
+    _, measurements = measured(MARK, 3, stage_yaw_rad=3e-5)
+    blind = calibrate(measurements, Options(assumed=()))
+    assert [cause.name for cause in blind.verdict.causes][:1] == ["yaw"]
+
+
+def test_a_larger_one_than_assumed_enlarges_the_uncertainty():
+    _, measurements = measured(MARK, 3, stage_yaw_rad=3e-4)
+    found = calibrate(measurements)
+    (cause,) = found.verdict.causes
+    assert cause.name == "yaw"
+    assert 2e-4 < cause.size < 1.5e-3
+    assert found.verdict.qualified
+
+
+def test_one_line_of_marks_shows_it_too():
+    plan, rng = image_plan(7), np.random.default_rng(2)
+    image = replace(plan.views[0].image, ny=1)
+    more = replace(plan.views[0], name="shifted", translation_m=(PITCH, 0.0))
+    plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
+    truth = random_truth(plan.artifact, 3, rng, Spread(
+        phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0))
+    found = calibrate(simulate_measurements(truth, plan, rng, settings=CellSettings(
+        sigma_xy_m=MARK, servo_sigma_m=0.0)))
+    assert set(found.extra["camera"]) == {"yaw"}
+    away = turns(truth, found.extra["camera"])
+    assert 0.6 < np.sqrt((away**2).mean()) < 1.5
+    assert found.extra["camera"]["yaw"]["p"] < 1e-3
