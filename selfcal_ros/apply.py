@@ -15,8 +15,8 @@ from selfcal_ros.compensation.cells import Interpolation, Outside
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
-from selfcal_ros.files import read_json
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.results import read_result
 
 MOST_NODES = 15
 """Nodes along a side between which distances are judged."""
@@ -182,7 +182,7 @@ def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarra
 
 def load(path: str | os.PathLike, *, method: Interpolation | None = None,
          outside: Outside = "clamp") -> StageMap:
-    """Return the calibrated stage of a RESULT.json.
+    """Return the calibrated stage of a RESULT.json, or of a bag with an embedded one.
 
     Raises
     ------
@@ -191,4 +191,4 @@ def load(path: str | os.PathLike, *, method: Interpolation | None = None,
     NotIdentifiableError
         If its plan does not identify the stage.
     """
-    return StageMap(result_from_dict(read_json(path), str(path)), method=method, outside=outside)
+    return StageMap(read_result(path), method=method, outside=outside)

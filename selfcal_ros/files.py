@@ -245,8 +245,12 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
 
 def read_text(path: str | os.PathLike, limit: int | None = None) -> str:
     """Return the UTF-8 text of `path`; InputError names the byte that is not UTF-8."""
+    return _decoded(read_bytes(path, limit), path)
+
+
+def _decoded(raw: bytes, path: str | os.PathLike) -> str:
     try:
-        return read_bytes(path, limit).decode()
+        return raw.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start}", "not UTF-8 text",
                          "save the file as UTF-8") from error
@@ -265,7 +269,12 @@ def read_json(path: str | os.PathLike, limit: int | None = None) -> Any:
 
     `limit` as for `read_bytes`; with it, at most `MAX_JSON_VALUES` values.
     """
-    text = read_text(path, limit)
+    return parse_json(read_bytes(path, limit), path, limit)
+
+
+def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) -> Any:
+    """Return the JSON value in the content of `path`, as `read_json`."""
+    text = _decoded(raw, path)
     if limit is not None and text.count(",") >= MAX_JSON_VALUES:
         raise InputError(str(path), f"more than {MAX_JSON_VALUES} values", "name a smaller file")
     try:

@@ -24,12 +24,11 @@ from selfcal_ros.bagio.mcap_salvage import HEAD
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import InputError
 from selfcal_ros.outputs import atomic_file
+from selfcal_ros.results import REMEDY, attachments
 
 BLOCK = 1 << 20
 DATA_END_SIZE = HEAD.size + 4
-REMEDY = "record it anew, or give an .mcap file that was closed, without file compression"
-PARSERS = {Opcode.STATISTICS: Statistics.read, Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
-           Opcode.ATTACHMENT: Attachment.read}
+PARSERS = {Opcode.STATISTICS: Statistics.read, Opcode.ATTACHMENT_INDEX: AttachmentIndex.read}
 _WRITTEN_ANEW = (Opcode.SUMMARY_OFFSET, Opcode.STATISTICS, Opcode.ATTACHMENT_INDEX)
 
 
@@ -59,19 +58,7 @@ def attached(bag: str | Path) -> dict[str, bytes]:
     InputError
         If a file of the bag has no summary, or an attachment is damaged.
     """
-    out: dict[str, bytes] = {}
-    for path in BagReader(Path(bag)).files:
-        with path.open("rb") as file:
-            for entry in _summary(file, path).index:
-                file.seek(entry.offset)
-                raw = file.read(entry.length)
-                record = _parsed(raw[0], raw[HEAD.size:]) if len(raw) > HEAD.size else None
-                if not isinstance(record, Attachment) or int.from_bytes(raw[-4:], "little") \
-                        not in (0, zlib.crc32(raw[HEAD.size:-4])):  # 0 = not computed
-                    raise InputError(f"{path}: {entry.name}", "the attachment is damaged",
-                                     "embed it again into a copy of the recording")
-                out[entry.name] = bytes(record.data)
-    return out
+    return attachments(BagReader(Path(bag)).files)
 
 
 def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns: int) -> None:

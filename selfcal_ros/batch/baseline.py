@@ -5,6 +5,7 @@ Each whole map is tested against it as in `selfcal diff`; the tests of all maps 
 together (Benjamini and Hochberg), so that a map of stable machines is rarely named.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from scipy.stats import false_discovery_control
 from selfcal_ros.batch.folder import Record
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
-from selfcal_ros.files import read_json
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 LEVEL = 0.05
@@ -27,7 +28,7 @@ def compared(records: Sequence[Record], folder: Path, baseline: CalibrationResul
     """Return the records with `baseline` and further quantities, where their map can be compared.
 
     `baseline`: {p, adjusted_p, changed}. The quantities are largest and rms difference, datum
-    difference removed.
+    difference removed. A map that cannot be compared has the reason in `not_compared`.
 
     Parameters
     ----------
@@ -38,18 +39,16 @@ def compared(records: Sequence[Record], folder: Path, baseline: CalibrationResul
     baseline : CalibrationResult
         The map to compare with.
     where : str
-        Its file, for errors.
-
-    Raises
-    ------
-    InputError
-        If no map has the lattice of the baseline.
+        Its file, for the reasons.
     """
-    found = {number: difference for number, record in enumerate(records)
-             if (difference := _difference(record, folder, baseline, where)) is not None}
-    if not found:
-        raise InputError(where, "no bag has a map of this lattice",
-                         "name a RESULT.json of the plate that was measured")
+    tried = {number: _difference(record, folder, baseline, where)
+             for number, record in enumerate(records)
+             if record.get("quantities") and "result" in record}
+    found = {number: difference for number, difference in tried.items()
+             if isinstance(difference, MapDifference)}
+    records = [record | {"not_compared": tried[number]}
+               if isinstance(tried.get(number), str) else record
+               for number, record in enumerate(records)]
     p = {number: value for number, difference in found.items()
          if np.isfinite(value := probability(difference))}
     adjusted = dict(zip(p, false_discovery_control(list(p.values())), strict=True)) if p else {}
@@ -72,15 +71,12 @@ def probability(difference: MapDifference) -> float:
 
 
 def _difference(record: Record, folder: Path, baseline: CalibrationResult,
-                where: str) -> MapDifference | None:
-    if not record.get("quantities") or "result" not in record:
-        return None
+                where: str) -> MapDifference | str:
     file = folder / record["result"]
     try:
-        return compare(baseline, result_from_dict(read_json(file), str(file)),
-                       names=(where, str(file)))
-    except InputError:  # another lattice, or nothing that both know
-        return None
+        return compare(baseline, read_result(file), names=(where, str(file)))
+    except InputError as error:  # another lattice, or nothing that both know
+        return error.what
 
 
 def _quantities(difference: MapDifference) -> dict[str, float | None]:
@@ -97,5 +93,7 @@ def sentence(records: Sequence[Record], where: str) -> str:
     changed = [record for record in tested if record["baseline"]["changed"]]
     named = ", ".join(f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})"
                       for record in changed)
+    others = Counter(record["not_compared"] for record in records if "not_compared" in record)
     return (f"{len(changed)} of {len(tested)} maps differ from {where}"
-            + (f": {named}" if changed else ""))
+            + (f": {named}" if changed else "")
+            + "".join(f"; not compared: {count} ({reason})" for reason, count in others.items()))

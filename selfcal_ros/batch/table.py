@@ -109,15 +109,16 @@ def csv_text(records: Sequence[Record]) -> str:
     names = dict.fromkeys(name for record in ordered for name in record.get("quantities", {}))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    compared = ["baseline_p", "changed"] * any("baseline" in record for record in ordered)
+    compared = ["baseline_p", "changed", "not_compared"] * any(
+        {"baseline", "not_compared"} & set(record) for record in ordered)
     writer.writerow([*BASE, "cause", "cause_view", *compared, *names])
     for record in ordered:
         found, causes = record.get("quantities", {}), record.get("causes", [])
         likeliest = causes[0] if causes else {"name": "", "view": ""}
         writer.writerow([_field(record.get(name)) for name in BASE]
                         + [likeliest["name"], likeliest["view"]]
-                        + [_field((record.get("baseline") or {}).get(name))
-                           for name in ("adjusted_p", "changed") if compared]
+                        + [_field(((record.get("baseline") or {}) | record).get(name))
+                           for name in ("adjusted_p", "changed", "not_compared") if compared]
                         + [_field(found.get(name)) for name in names])
     return out.getvalue()
 

@@ -4,7 +4,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal import add_json, file_of, say
+from selfcal_ros.cli.terminal import add_json, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,9 +45,10 @@ def run(args: argparse.Namespace) -> int:
 
     from selfcal_ros.apply import load
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.cli.trace import outputs_of, record
     from selfcal_ros.files import check_outputs, read_text, write_text
 
-    check_outputs([args.result, args.points], [file_of(args)])
+    check_outputs([args.result, args.points], outputs_of(args))
     stage = load(args.result, method=args.method, outside=args.outside)
     points = read_points(read_text(args.points), args.points)
     if points.shape[1] == len(ENDS):
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         say(args, text.removesuffix("\n"), {"csv": text})
     else:
         write_text(args.output, text)
+        record(args, stage.result, [args.output])
         say(args, f"written: {args.output}, {len(points)} points",
             {"written": args.output, "points": len(points), "unknown": unknown,
              "outside": outside})

@@ -83,9 +83,6 @@ def run(args: argparse.Namespace) -> int:
         lines = summary_lines(records, found, before)
         if baseline is not None:
             lines += [sentence(records, args.baseline)]
-            if others := sum("baseline" not in r and bool(r.get("quantities")) for r in records):
-                lines += ["maps not compared, of another lattice or with too few nodes in common: "
-                          f"{others}"]
         content = batch_json(records, found, before)
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))
@@ -99,10 +96,9 @@ def _baseline(file: str | None) -> "CalibrationResult | None":
     """Return the map to compare with, None if there is none to be."""
     if file is None:
         return None
-    from selfcal_ros.files import read_json
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.results import read_result
 
-    return result_from_dict(read_json(file), file)
+    return read_result(file)
 
 
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",

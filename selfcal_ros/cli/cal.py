@@ -191,6 +191,7 @@ def _export(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech import export
     from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.cli.trace import command, record, records_of
     from selfcal_ros.compensation.export import provenance
     from selfcal_ros.compensation.residual import combined
     from selfcal_ros.files import check_outputs
@@ -199,7 +200,8 @@ def _export(args: argparse.Namespace) -> int:
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
     result, filled = ready(args)
-    comments = [*provenance(result, frame, filled=filled), "zero at home by the controller"]
+    comments = [*provenance(result, frame, filled=filled, command=command(args)),
+                "zero at home by the controller"]
     error_map, active = result.error_map, _active(args, frame)
     if active is not None:
         error_map = combined(error_map, frame, active)
@@ -214,7 +216,7 @@ def _export(args: argparse.Namespace) -> int:
         table = export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=export.theta_decimals(result.error_map))
-    check_outputs([args.result, args.onto], texts)
+    check_outputs([args.result, args.onto], [*texts, *records_of(texts)])
     refuse_existing(list(texts), force=args.force)
     lines, files = [], []
     for path, text in texts.items():
@@ -222,6 +224,7 @@ def _export(args: argparse.Namespace) -> int:
         kind = "1D table for theta" if path != args.output else "2D table for x and y"
         lines.append(f"{path}: {kind}" + (f"; the old file is {backup}" if backup else ""))
         files.append({"file": path, "kind": kind, "old_file": backup and str(backup)})
+    record(args, result, texts)
     say(args, "\n".join(lines), {"files": files, "filled": filled})
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
         print("selfcal cal: the theta table covers one turn either way and does not roll over;"
@@ -240,8 +243,9 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     from dataclasses import replace
 
     from selfcal_ros.compensation.export import fill_unknown
+    from selfcal_ros.results import read_result
 
-    result, filled = cal_lines.read_result(args.result), 0
+    result, filled = read_result(args.result), 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
                                    "measure the missing views",
@@ -275,8 +279,9 @@ def _verify(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.read import load_cal
     from selfcal_ros.aerotech.verify import verify_tables
     from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
+    from selfcal_ros.results import read_result
 
-    result, cal = cal_lines.read_result(args.result), load_cal(args.file)
+    result, cal = read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)
     if base is None and isinstance(cal.tables[0], Table2D):
         base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)

@@ -150,14 +150,6 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     return replace(base, **changes)
 
 
-def read_result(path: str) -> "CalibrationResult":
-    """Return the result in a RESULT.json; InputError if it is invalid."""
-    from selfcal_ros.files import read_json
-    from selfcal_ros.model.result import result_from_dict
-
-    return result_from_dict(read_json(path), path)
-
-
 def add_line_tables(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
     square = group.add_parser(
@@ -207,6 +199,7 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 def _orthogonality(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech import lines as cal_lines
     from selfcal_ros.compensation.frame import UNITS_M
+    from selfcal_ros.results import read_result
 
     frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
@@ -259,6 +252,7 @@ def _straightness(args: argparse.Namespace) -> int:
 def _line(args: argparse.Namespace, corrected: Axis) -> int:
     from selfcal_ros.aerotech import lines as cal_lines
     from selfcal_ros.files import read_text
+    from selfcal_ros.results import read_result
 
     frame, result = _frame(args), None
     if Path(args.source).suffix.lower() == ".csv":
@@ -293,19 +287,23 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from selfcal_ros.aerotech.lines import line_table
     from selfcal_ros.aerotech.write import cal_text, write_cal
     from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.compensation.export import verdict_lines
+    from selfcal_ros.cli.trace import command, outputs_of, record
+    from selfcal_ros.compensation.export import origin_lines, verdict_lines
     from selfcal_ros.files import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
                 f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
-                *([] if result is None else verdict_lines(result)), frame.comment()]
+                *([] if result is None else [*origin_lines(result, command(args)),
+                                             *verdict_lines(result)]), frame.comment()]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
-        check_outputs([args.source], [args.output])
+        check_outputs([args.source], outputs_of(args))
         backup = write_cal(args.output, text, force=args.force)
+        if result is not None:
+            record(args, result, [args.output])
         say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
             + (f"; the old file is {backup}" if backup else ""),
             found | {"file": args.output, "old_file": backup and str(backup)})

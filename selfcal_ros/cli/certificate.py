@@ -3,7 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
+from selfcal_ros.cli.terminal import STDOUT, add_json, say
 
 HELP = "write a digital calibration certificate: DCC 3.3.0 (XML)"
 
@@ -26,13 +26,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read result and details, write the certificate."""
     from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.files import check_outputs, read_json, read_yaml, write_bytes
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.cli.trace import outputs_of, record
+    from selfcal_ros.files import check_outputs, read_yaml, write_bytes
+    from selfcal_ros.results import read_result
     from selfcal_ros.standards.dcc import certificate, is_traceable
     from selfcal_ros.standards.details import details_from_dict
 
-    check_outputs([args.result, args.details], [file_of(args)])
-    result = result_from_dict(read_json(args.result), args.result)
+    check_outputs([args.result, args.details], outputs_of(args))
+    result = read_result(args.result)
     details = details_from_dict(read_yaml(args.details), args.details)
     xml = certificate(result, details, covariance=args.covariance,
                       not_qualified=args.not_qualified)
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
         say(args, xml.decode().removesuffix("\n"), {"xml": xml.decode()})
         return exit_code(result)
     write_bytes(args.output, xml)
+    record(args, result, [args.output])
     traceable = is_traceable(result)
     say(args, f"written: {args.output}, {'' if traceable else 'not '}traceable",
         {"written": args.output, "traceable": traceable, "qualified": result.verdict.qualified})

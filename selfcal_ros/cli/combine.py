@@ -60,11 +60,11 @@ def read_parts(names: Sequence[str]) -> list[Part]:
     from selfcal_ros.errors import InputError
     from selfcal_ros.estimation.comparison.combine import Part
     from selfcal_ros.estimation.comparison.external import map_from_table
-    from selfcal_ros.files import read_json, read_text
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.files import read_text
+    from selfcal_ros.results import read_result
 
     tables = [name for name in names if name.lower().endswith(".csv")]
-    results = {name: result_from_dict(read_json(name), name)
+    results = {name: read_result(name)
                for name in names if name not in tables}
     if not results:
         raise InputError(names[0], "no RESULT.json is named", "name at least one: it gives the "

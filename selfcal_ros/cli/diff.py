@@ -38,12 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.terminal import say_unless_qualified
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
-    from selfcal_ros.files import check_outputs, read_json
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.files import check_outputs, parse_json
+    from selfcal_ros.results import read_result, result_bytes
 
     check_outputs([args.a, args.b], [args.plot])
-    first, second = read_json(args.a), read_json(args.b)
-    a = result_from_dict(first, args.a)
+    a, (name, raw) = read_result(args.a), result_bytes(args.b)
+    second = parse_json(raw, name)
     if isinstance(second, dict) and "ex_x" in second:
         if args.keep_scale:
             raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             {**_laser_json(rows), **_grades([a])})
         say_unless_qualified(a, f"selfcal diff: {args.a}")
         return int(ExitCode.DONE)
-    b = result_from_dict(second, args.b)
+    b = read_result(args.b)
     if args.keep_scale:
         for name, result in ((args.a, a), (args.b, b)):
             if result.reference is None:

@@ -4,6 +4,7 @@
 import argparse
 import mimetypes
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from selfcal_ros.cli.terminal import add_json, say
@@ -33,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
     if args.files and args.extract:
         raise InputError("--extract", "files are named, too", "embed first, then extract")
     if args.files:
-        items = [(Path(name).name, _kind(name), read_bytes(name)) for name in args.files]
+        names = with_records(args.files)
+        items = [(Path(name).name, _kind(name), read_bytes(name)) for name in names]
         check_results(args.bag, args.files)
         attach(args.bag, items, time.time_ns())
     found = attached(args.bag)
@@ -47,6 +49,18 @@ def run(args: argparse.Namespace) -> int:
         "bag": args.bag, "extracted": args.extract or "",
         "attachments": [{"name": name, "bytes": len(data)} for name, data in found.items()]})
     return 0
+
+
+def with_records(names: Sequence[str]) -> list[str]:
+    """Return files and the records beside them; refuse files that are not as exported."""
+    from selfcal_ros.cli.trace import origin, records_of, require_unchanged
+    from selfcal_ros.files import read_bytes
+
+    more = [(name, beside) for name, beside in zip(names, records_of(names), strict=True)
+            if Path(beside).is_file() and beside not in names]
+    for name, beside in more:
+        require_unchanged(name, read_bytes(name), origin(read_bytes(beside), beside))
+    return [*names, *(beside for _, beside in more)]
 
 
 def _kind(name: str) -> str:

@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.aerotech.write import refuse_existing, write_cal
     from selfcal_ros.cli.cal import figures_of, ready, residual_text
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.cli.trace import command, record, records_of
     from selfcal_ros.controllers.export import export, loaded
     from selfcal_ros.controllers.grid import Source
     from selfcal_ros.files import check_outputs, read_text
@@ -53,10 +54,12 @@ def run(args: argparse.Namespace) -> int:
     active = None
     if args.onto:
         active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
-    made = export(args.format, result, wiring, args.output, active=active, filled=filled)
-    check_outputs([args.result, *(args.onto or ())], made.files)
+    made = export(args.format, result, wiring, args.output, active=active, filled=filled,
+                  command=command(args))
+    check_outputs([args.result, *(args.onto or ())], [*made.files, *records_of(made.files)])
     refuse_existing(list(made.files), force=args.force)
     backups = {path: write_cal(path, text, force=args.force) for path, text in made.files.items()}
+    record(args, result, made.files)
     lines = [path + (f"; the old file is {backup}" if backup else "")
              for path, backup in backups.items()]
     if args.verify:

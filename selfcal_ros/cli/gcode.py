@@ -3,7 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
+from selfcal_ros.cli.terminal import STDOUT, add_json, say
 
 HELP = "correct a G-code program: for controllers without tables"
 
@@ -32,7 +32,9 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.cal import ready
     from selfcal_ros.cli.cal_lines import frame_of
     from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.controllers.gcode import Rewriter, corrected_program
+    from selfcal_ros.cli.trace import command, outputs_of, record
+    from selfcal_ros.compensation.export import origin_lines
+    from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
     from selfcal_ros.controllers.grid import Wiring, wanted
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import check_outputs, read_text, write_text
@@ -43,17 +45,19 @@ def run(args: argparse.Namespace) -> int:
                          "give 0.001 to 10000 um and 1 to 9 decimals")
     unit = args.unit = args.unit or "mm"
     frame = replace(frame_of(args), unit="m")
-    check_outputs([args.program, args.result], [file_of(args)])
+    check_outputs([args.program, args.result], outputs_of(args))
     result, filled = ready(args)
     plate = result.artifact
     rewriter = Rewriter(
         wanted(result.error_map, Wiring(frame)), tolerance_m=args.tolerance * M_PER_UM,
         step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
     made = corrected_program(read_text(args.program), args.program, rewriter)
+    program = commented(made.text, "; ".join(origin_lines(result, command(args))))
     if args.output == STDOUT:
-        say(args, made.text.removesuffix("\n"), {"program": made.text})
+        say(args, program.removesuffix("\n"), {"program": program})
     else:
-        write_text(args.output, made.text)
+        write_text(args.output, program)
+        record(args, result, [args.output])
         say(args, f"written: {args.output}, {made.moves} moves as {made.pieces}", {
             "written": args.output, "moves": made.moves, "pieces": made.pieces, "filled": filled})
     return exit_code(result)

@@ -69,6 +69,7 @@ def main(argv: list[str] | None = None) -> int:
         words = sys.argv[1:] if argv is None else argv
         parser = build_parser(words[0] if words else None)
         args = parser.parse_args(argv)
+        args.words = words
         said = f"selfcal {args.verb}"
         code = int(args.run(args))
         sys.stdout.flush()

@@ -24,13 +24,13 @@ def run(args: argparse.Namespace) -> int:
 
     from selfcal_ros.cli.report import read_truth
     from selfcal_ros.errors import ExitCode
-    from selfcal_ros.files import check_outputs, read_json
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.files import check_outputs
     from selfcal_ros.reporting.figures.maps import map_picture
     from selfcal_ros.reporting.figures.paper import save_picture
+    from selfcal_ros.results import read_result
 
     check_outputs([args.result, args.truth], [args.output])
-    result = result_from_dict(read_json(args.result), args.result)
+    result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
         save_picture(map_picture(result, truth), args.output)

@@ -33,17 +33,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
     from selfcal_ros.aerotech.verify import table_chapter
-    from selfcal_ros.files import check_outputs, read_json
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.files import check_outputs
     from selfcal_ros.reporting.chapters import ABOUT
     from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.summary.numbers import can_print_symbols
     from selfcal_ros.reporting.summary.sections import summary_text
+    from selfcal_ros.results import read_result
 
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
     check_outputs([args.result, args.truth, args.details], [output, args.plot])
     check_name(output)
-    result = result_from_dict(read_json(args.result), args.result)
+    result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     more = [table_chapter(result)]
     if args.details:

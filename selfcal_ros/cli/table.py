@@ -4,7 +4,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, file_of, say
+from selfcal_ros.cli.terminal import STDOUT, add_json, say
 
 if TYPE_CHECKING:
     from selfcal_ros.model.result import CalibrationResult
@@ -33,21 +33,23 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from selfcal_ros.cli.terminal import exit_code
+    from selfcal_ros.cli.trace import outputs_of, record
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import check_outputs, read_json, write_bytes
-    from selfcal_ros.model.result import result_from_dict
+    from selfcal_ros.files import check_outputs, write_bytes
+    from selfcal_ros.results import read_result
 
     kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()
     if kind not in KINDS:
         raise InputError(args.output, "its ending is not that of a table",
                          "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
-    check_outputs([args.result], [file_of(args)])
-    result = result_from_dict(read_json(args.result), args.result)
+    check_outputs([args.result], outputs_of(args))
+    result = read_result(args.result)
     if args.output == STDOUT:
         text = csv_bytes(result).decode()
         say(args, text.removesuffix("\n"), {"csv": text})
         return exit_code(result)
     write_bytes(args.output, csv_bytes(result) if kind == ".csv" else npz_bytes(result))
+    record(args, result, [args.output])
     say(args, f"written: {args.output}", {"written": args.output, "kind": kind.lstrip(".")})
     return exit_code(result)
 
@@ -84,6 +86,7 @@ def npz_bytes(result: "CalibrationResult") -> bytes:
     out = io.BytesIO()
     np.savez(out, gx=emap.gx, gy=emap.gy, u_gx=emap.u_gx, u_gy=emap.u_gy, g_theta=emap.g_theta,
              u_g_theta=emap.u_g_theta, ax=result.artifact_map.ax, ay=result.artifact_map.ay,
+             result=np.str_(" sha256:".join(result.read_from or ())),
              a_theta=result.artifact_map.a_theta, grid_pitch=np.float64(plate.grid_pitch_m),
              nonorthogonality=np.float64(emap.nonorthogonality),
              scale_difference=np.float64(emap.scale_difference))

@@ -65,7 +65,7 @@ def _neighbours(shift: tuple[int, int], shape: tuple[int, int]) -> tuple[tuple, 
 
 
 def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 0,
-               now: datetime | None = None) -> list[str]:
+               command: str = "", now: datetime | None = None) -> list[str]:
     """Return comments with the origin and conventions of a table.
 
     Parameters
@@ -76,12 +76,15 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         Axes of the machine, for `selfcal cal verify`.
     filled : int
         Number of unknown sites that were filled.
+    command : str
+        Command line of the export.
     now : datetime, optional
         Date of the export, UTC.
     """
     emap, source = result.error_map, result.input
     lines = [
         f"written by selfcal {__version__} on {(now or datetime.now(UTC)):%Y-%m-%dT%H:%M:%SZ}",
+        *origin_lines(result, command),
         f"plan: {result.plan_id}; sense: {result.sense}; method: {result.method}",
         f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
         *verdict_lines(result),
@@ -97,6 +100,12 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
     if filled:
         lines.append(f"{filled} sites were not measured: mean of their neighbours")
     return lines
+
+
+def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:
+    """Return the command of an export, and file and digest of its result."""
+    return [*([f"command: {command}"] if command else []),
+            *(["result: {}; sha256: {}".format(*result.read_from)] if result.read_from else [])]
 
 
 def _uncertainty_line(result: CalibrationResult) -> str:

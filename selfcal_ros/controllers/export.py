@@ -100,7 +100,7 @@ class Exported:
 
 
 def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
-           active: Correction | None = None, filled: int = 0) -> Exported:
+           active: Correction | None = None, filled: int = 0, command: str = "") -> Exported:
     """Return the files of a controller, tried on a simulated one.
 
     Parameters
@@ -117,6 +117,8 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
         The table that was loaded during the calibration: the new one replaces it.
     filled : int
         Number of sites of the map that were filled.
+    command : str
+        Command line, for the comments.
 
     Raises
     ------
@@ -134,7 +136,7 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
     correct = form.read([Source("\n".join(lines) + "\n", names[part])
                          for part, lines in texts.items()], wiring)
     residuals = plane_residuals(emap, frame, correct, active)
-    comments = [form.what, *provenance(result, frame, filled=filled), *form.notes,
+    comments = [form.what, *provenance(result, frame, filled=filled, command=command), *form.notes,
                 *(IMPLIED if form.sign_is_implied else ()), _left(residuals[0])]
     if active is not None:
         comments.append("replaces the table that was loaded during the calibration")

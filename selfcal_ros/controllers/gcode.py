@@ -73,6 +73,18 @@ def corrected_program(text: str, where: str, rewriter: "Rewriter") -> Corrected:
     return Corrected("".join(out), rewriter.moves, rewriter.pieces)
 
 
+def commented(program: str, comment: str) -> str:
+    """Return a program with a comment as its first line, after a % and the program's number.
+
+    Between parentheses if the program has such comments, as not all controllers know both forms.
+    """
+    plain = re.sub(r"[^ -~]|[()]", "_", comment)
+    text = f"({plain})" if "(" in re.sub(";.*", "", program) else f"; {plain}"
+    head = re.match(r"(?:\s*%[^\n]*\n)?(?:[ \t]*O\d[^\n]*\n)?", program, re.I | re.ASCII)
+    at = head.end() if head else 0
+    return program[:at] + text + ("\r\n" if "\r\n" in program else "\n") + program[at:]
+
+
 class Rewriter:
     """The modal state of a program, and its corrected lines.
 

@@ -147,7 +147,8 @@ class CalibrationResult:
 
     `excluded` are effects outside the model, with what they would add to u at a nominal size.
     `findings` are the data of warnings; `warnings` are their sentences, added by
-    `selfcal_ros.reporting.words.findings.worded`, and those of the collection.
+    `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the
+    name of the file and its SHA-256, of a result that was read from one.
     """
 
     plan_id: str
@@ -171,6 +172,7 @@ class CalibrationResult:
     budget: tuple[BudgetLine, ...] = ()
     excluded: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
+    read_from: tuple[str, str] | None = None
 
     @property
     def artifact(self) -> Artifact:

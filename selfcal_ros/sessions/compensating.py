@@ -11,14 +11,14 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
+from selfcal_ros import results
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.compensator import Compensator, Interpolation
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_json
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, merged
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
@@ -61,7 +61,7 @@ class CompensatingSession:
             self._load_file(settings.map)
 
     def _load_file(self, path: str) -> None:
-        result = result_from_dict(read_json(path), path)
+        result = results.read_result(path)
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(path, "the map is not qualified", "measure again, or set "
                              "require_qualified to false")
@@ -351,7 +351,7 @@ def read_result(path: str) -> CalibrationResult:
     """
     if not path:
         raise InputError("path", "is empty", "name a file")
-    return result_from_dict(read_json(path, LARGEST_FILE), path)
+    return results.read_result(path, LARGEST_FILE)
 
 
 def is_qualified(result: CalibrationResult) -> bool:

@@ -241,6 +241,8 @@ def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
     for name in ("file", "sha256"):
         if result.input.get(name):
             yield f"readings, {name}", result.input[name]
+    for name, value in zip(("file", "sha256"), result.read_from or (), strict=False):
+        yield f"result, {name}", value
     for name, value in (("run", result.run_id), ("evaluated", made.created), *made.extra.items()):
         if value:
             yield name.replace("_", " "), str(value)

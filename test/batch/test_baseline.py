@@ -12,12 +12,12 @@ import pytest
 from selfcal_ros.batch.baseline import compared, probability, sentence
 from selfcal_ros.batch.table import csv_text
 from selfcal_ros.cli.main import main
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.reporting.words.findings import worded
 from test.support.options import bare
 from test.support.sessions import small_bag
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
@@ -74,10 +74,13 @@ def test_bags_without_a_map_remain_as_they_are(tmp_path):
     known = shelf(tmp_path, [result_of(1), result_of(1, artifact=Artifact(7, 0.01, 8))])
     failed = {"bag": "bad", "exit_code": 2, "qualified": None, "message": "no"}
     records = compared([failed, *known], tmp_path, result_of(0), "old.json")
-    assert records[0] is failed and records[2] is known[1]
-    assert sentence(records, "old.json") == "0 of 1 maps differ from old.json"
-    with pytest.raises(InputError, match=r"old\.json: no bag has a map of this lattice"):
-        compared([failed, known[1]], tmp_path, result_of(0), "old.json")
+    assert records[0] is failed and set(records[2]) - set(known[1]) == {"not_compared"}
+    reason = records[2]["not_compared"]
+    assert "lattice" in reason or "plate" in reason
+    assert sentence(records, "old.json") == (
+        f"0 of 1 maps differ from old.json; not compared: 1 ({reason})")
+    rows = list(csv.DictReader(io.StringIO(csv_text(records))))
+    assert [row["not_compared"] for row in rows] == ["", "", reason]
 
 
 def test_without_uncertainties_nothing_is_tested(tmp_path):
@@ -101,6 +104,17 @@ def test_the_verb_compares_with_a_result(tmp_path, capsys):
     assert main(["batch", bag, "-o", str(out), "--baseline", str(tmp_path / "none.json")]) == 2
 
 
+def test_a_batch_without_any_map_of_the_baseline_is_written(tmp_path, capsys):
+    """The bags are solved for hours: the table must not be lost for it."""
+    write_json(tmp_path / "old.json", result_to_dict(worded(result_of(0))))
+    out = tmp_path / "out"
+    assert main(["batch", "bags/hu_noise", "-o", str(out), "--workers", "1",
+                 "--baseline", str(tmp_path / "old.json")]) == 0
+    assert "0 of 0 maps differ from" in capsys.readouterr().out
+    (row,) = csv.DictReader((out / "table.csv").read_text().splitlines())
+    assert row["not_compared"] and row["changed"] == row["baseline_p"] == ""
+
+
 def test_maps_that_are_not_compared_are_counted(tmp_path, capsys):
     out = tmp_path / "out"
     (tmp_path / "other").mkdir()
@@ -110,4 +124,4 @@ def test_maps_that_are_not_compared_are_counted(tmp_path, capsys):
                  "--baseline", str(tmp_path / "old.json")]) == 0
     said = capsys.readouterr().out
     assert "0 of 1 maps differ from" in said
-    assert "maps not compared, of another lattice or with too few nodes in common: 1" in said
+    assert "; not compared: 1 (" in said

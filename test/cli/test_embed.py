@@ -55,13 +55,14 @@ def test_files_go_in_and_out_and_the_messages_stay(bag, tmp_path, capsys):
     table = tmp_path / "t.csv"
     assert main(["table", str(result), "-o", str(table)]) == 0
     assert main(["embed", str(bag), str(table)]) == 0
-    assert set(seen(bag)[1]) == {"r.json", "hu.yaml", "t.csv"} == set(attached(bag))
+    kept = ["r.json", "hu.yaml", "t.csv", "t.csv.origin.json"]
+    assert set(seen(bag)[1]) == set(kept) == set(attached(bag))
     out = tmp_path / "out"
     out.mkdir()
     capsys.readouterr()
     assert main(["embed", str(bag), "--extract", str(out), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert [item["name"] for item in said["attachments"]] == ["r.json", "hu.yaml", "t.csv"]
+    assert [item["name"] for item in said["attachments"]] == kept
     for path in (result, plan, table):
         assert (out / path.name).read_bytes() == path.read_bytes()
     again = tmp_path / "again.json"
@@ -92,7 +93,7 @@ def test_a_name_is_taken_once(bag, tmp_path):
     (lambda raw: raw[:-20], "no MCAP file with a summary"),
     (lambda raw: raw[:40], "no MCAP file with a summary"),
     (lambda raw: b"", "no MCAP file with a summary"),
-    (lambda raw: raw.replace(b"kept as it is", b"kept as it was"[:13]), "attachment is damaged"),
+    (lambda raw: raw.replace(b"kept as it is", b"kept as it was"[:13]), "an attachment is damaged"),
 ])
 def test_a_file_that_was_not_closed_or_is_damaged_is_refused(bag, spoil, message):
     attach(bag, [("a.txt", "text/plain", b"kept as it is")], 1)

@@ -6,12 +6,13 @@ from pathlib import Path
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.files import read_json, read_yaml
+from selfcal_ros.files import read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 from selfcal_ros.model.view import Plan, plan_from_dict, plan_to_dict
+from selfcal_ros.results import read_result
 
 
 def read_plan(path: str | Path) -> Plan:
@@ -55,7 +56,7 @@ def calibration_of(path: str) -> CalibrationResult:
     InputError
         If there is none.
     """
-    return result_from_dict(read_json(path), path)
+    return read_result(path)
 
 
 def solver_options(settings: SolverSettings, measurements: Measurements | None = None, *,
