@@ -299,7 +299,9 @@ REMEDY = {
     Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
                         "joint_y and measurement_sense, or set max_stage_distance",
     Reason.OUTSIDE_IMAGE: "they lie beyond the marks that an image shows; raise nx and ny under "
-                          "image in the plan",
+                          "image in the plan, or if the plate lies half a pitch or more off its "
+                          "place: state that in the plan (translation_mm of the views), or let the "
+                          "detections carry ids",
     Reason.SEVERAL: "an exposure shows several marks, and the plan knows of one; state in the plan "
                     "how many an image shows (image: {nx: 3, ny: 3}), or publish the mark nearest "
                     "to the optical axis alone",

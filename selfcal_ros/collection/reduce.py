@@ -17,6 +17,7 @@ from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sig
 from selfcal_ros.collection.marks import cells, identify
 from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
+from selfcal_ros.collection.marks.rigid import Rigid
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
@@ -213,24 +214,76 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
     d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
-    offset = np.stack([d["ox"], d["oy"]])
-    number = cells.numbers_of(view, cells.cells_of(view, offset))
-    beside = cells.places_of_cells(view, offset)
-    found = identify.identify_grid(
-        artifact, view, _reading(rules.sense, position, offset),
-        ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
-        stage_m=_reading(rules.sense, position, beside), beside_m=beside if view.image else None)
-    found.reasons[number < 0] = Reason.OUTSIDE_IMAGE
-    away = found.reasons == Reason.NOT_AT_MARK
-    if away.any():
-        away &= np.isin(d["stamp"], d["stamp"][found.reasons == None])  # noqa: E711
-        found.reasons[away] = Reason.SEVERAL
+    found, number = _identified(artifact, view, d, position, rules)
     d, (position, index, deviation, residual, approach, number) = _keep(
         d, found.reasons, rejected, position, found.index, found.deviation, found.residual,
         approach, number, places=places)
     told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
     return _GridMarks(d, index, deviation, residual, position, approach,
                       found.rigid.phi_rad if told else None, number)
+
+
+def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray,
+                rules: Rules) -> tuple[identify.MarkAssignment, np.ndarray]:
+    """Return the marks of detections with the stage at `position` (2, n), and their cells (n,).
+
+    A plate may lie half a pitch of the image or more off its place, in a view whose images show
+    it: the marks are displaced in the image, and without ids they lie beside the plate.
+    """
+    found, number = _identified_at(artifact, view, d, position, rules)
+    if view.image is None or not np.isin(found.reasons, DISPLACED).any():
+        return found, number
+    offset = np.stack([d["ox"], d["oy"]])
+    named = d["has_id"] & (found.reasons != Reason.UNKNOWN_MARK)
+    site = np.stack(view.on_stage(artifact).site_of(d["m"][named], d["n"][named]))
+    away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
+    away -= site * artifact.grid_pitch_m
+    plate = 0j if named.any() else displacement(
+        artifact, view, found.rigid, _reading(rules.sense, position, offset))
+    tried = _identified_at(artifact, view, d, position, rules, plate=plate,
+                           shift=cells.shift_of(view, offset, away))
+    return tried if plate or _found(tried[0]) > _found(found) else (found, number)
+
+
+DISPLACED = (Reason.OUTSIDE_IMAGE, Reason.NOT_AT_MARK, Reason.SEVERAL, Reason.TOO_FAR,
+             Reason.NOT_IN_VIEW)
+"""Reasons of rejection of marks in images of a displaced plate."""
+
+
+def _found(marks: identify.MarkAssignment) -> int:
+    return int((marks.reasons == None).sum())  # noqa: E711
+
+
+def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.ndarray) -> complex:
+    """Return by how many whole pitches marks without ids lie beside the plate, stage frame."""
+    pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
+    centred = reading_m - np.array(pose.shift)[:, None] * pitch
+    on_plate = np.rint(np.stack(pose.turned_back(*(rigid.undo(centred) / pitch))))
+    beside = (cells.middle_of(row, side) for row, side in zip(
+        on_plate, artifact.shape, strict=True))
+    x, y = pose.turned(*(np.array([float(number)]) for number in beside))
+    return complex(x[0], y[0])
+
+
+def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray,
+                   rules: Rules, *, shift: complex = 0j, plate: complex = 0j,
+                   ) -> tuple[identify.MarkAssignment, np.ndarray]:
+    """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
+    offset = np.stack([d["ox"], d["oy"]])
+    number = cells.numbers_of(view, cells.cells_of(view, offset, shift))
+    beside = cells.places_of_cells(view, offset, shift)
+    away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m
+    found = identify.identify_grid(
+        artifact, view, _reading(rules.sense, position, offset) - away,
+        ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
+        stage_m=_reading(rules.sense, position, beside), beside_m=beside if view.image else None)
+    found = replace(found, deviation=found.deviation + away)
+    found.reasons[number < 0] = Reason.OUTSIDE_IMAGE
+    astray = found.reasons == Reason.NOT_AT_MARK
+    if astray.any():
+        astray &= np.isin(d["stamp"], d["stamp"][found.reasons == None])  # noqa: E711
+        found.reasons[astray] = Reason.SEVERAL
+    return found, number
 
 
 def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Kind, Reason
+from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation import physics
 from test.support.collecting import collect, digest, scene
@@ -63,6 +64,69 @@ def test_the_order_of_arrival_changes_nothing():
     for one, other in zip(measurements.views, again.views, strict=True):
         assert one.view == other.view
         np.testing.assert_array_equal([one.dx, one.dy], [other.dx, other.dy])
+
+
+def displaced(plan, t_m, *, ids, follow=False, sense=Sense.MICROSCOPE_MOVES,
+              shown=lambda detection: True):
+    """Return truth, readings and progress of plates at `t_m`, from the detections `shown`."""
+    shot = scene(plan, with_ids=ids, follow_mark=follow, sense=sense, t_m=t_m, **QUIET)
+    kept = [d for d in shot.detections if shown(d)]
+    return shot, *collect([*shot.commands, *shot.samples, *kept], measurement_sense=str(sense))
+
+
+@pytest.mark.parametrize("ids", [True, False])
+@pytest.mark.parametrize("t_m", [(0.5e-3, 0.0), (0.6e-3, -0.7e-3), (-1.2e-3, 0.4e-3)])
+@pytest.mark.parametrize("sense", Sense)
+def test_a_plate_off_its_place_by_more_than_half_a_pitch_loses_no_mark(sense, t_m, ids):
+    """The stage stops at the nominal sites: in all images the marks are displaced."""
+    shot, measurements, progress = displaced(PLAN, t_m, ids=ids, sense=sense)
+    assert not measurements.all_rejected()
+    assert all(view.complete for view in progress.values())
+    sign = -1 if sense is Sense.PLATE_MOVES else 1
+    for number, view in enumerate(measurements.views[:-1]):
+        turn, (cx, cy) = number // 9, view.view.cell
+        place, site = physics.mark_places(shot.truth, turn, PLAN.views[turn], (view.m, view.n))
+        x, y = rotated(turn, view.m, view.n)
+        error = sign * shot.truth.g[:, sign * (x - cx) + 3, sign * (y - cy) + 3]
+        np.testing.assert_allclose([view.dx, view.dy], place - site + error, atol=1e-14)
+
+
+@pytest.mark.parametrize("ids", [True, False])
+def test_the_map_of_a_displaced_plate_is_that_of_the_one_in_place(ids):
+    plan, maps = image_plan(5, turns=(0, 90), repeats=2), []
+    for t_m in ((0.0, 0.0), (0.6e-3, -0.7e-3)):
+        measurements = displaced(plan, t_m, ids=ids)[1]
+        maps.append(calibrate(measurements).error_map)
+    for axis in "xy":
+        np.testing.assert_allclose(*(getattr(found, f"g{axis}") for found in maps), atol=2e-10)
+
+
+def test_of_a_part_of_the_image_ids_tell_the_cells():
+    """Only the two left columns of each image are visible: they could be the two right ones."""
+    _, told, progress = displaced(PLAN, (0.6e-3, 0.0), ids=True,
+                                  shown=lambda d: d.offset_x < 1.1e-3)
+    assert not told.all_rejected()
+    assert {view.view.cell[0] for view in told.views if view.used and view.view.grid} == {-1, 0}
+    assert not any(view.complete for view in list(progress.values())[:3])
+
+
+def test_a_stage_that_follows_a_plate_a_pitch_away_is_named_and_no_mark_misnamed():
+    for ids in (True, False):
+        _, measurements, _ = displaced(image_plan(7), (1.2e-3, 0.0), ids=ids, follow=True)
+        assert measurements.all_rejected() == {str(Reason.NOT_AT_MARK): 722}
+
+
+def test_four_columns_in_images_of_a_plan_of_three_are_counted():
+    shot = scene(image_plan(7, marks=5), **QUIET)
+    plan = image_plan(7, marks=3)
+    commands = [replace(c, view=replace(c.view, image=plan.views[0].image)) if c.view else c
+                for c in shot.commands]
+    kept = [d for d in shot.detections if d.offset_x > -1.5e-3]
+    measurements, _ = collect([*commands, *shot.samples, *kept])
+    rejected = measurements.all_rejected()
+    assert set(rejected) == {str(Reason.OUTSIDE_IMAGE)}
+    assert sum(view.used for view in measurements.views) == 722
+    assert rejected[str(Reason.OUTSIDE_IMAGE)] == len(kept) - 722
 
 
 def test_marks_beyond_the_image_of_the_plan_are_named():

@@ -48,12 +48,18 @@ class Scene:
 
 
 def scene(text: str | Plan = "0", *, size: int = 5, count: int = 8, line: bool = False,
-          repeats: int = 1, seed: int = 3, **settings: Any) -> Scene:
-    """Return the messages of a plan, or of one such as '0, 90, tx', on a stage with errors."""
+          repeats: int = 1, seed: int = 3, t_m: tuple[float, float] | None = None,
+          **settings: Any) -> Scene:
+    """Return the messages of a plan, or of one such as '0, 90, tx', on a stage with errors.
+
+    `t_m` is the displacement of the plate in all views, random if not given.
+    """
     plan = text if isinstance(text, Plan) else plan_of(text, size, count=count, line=line,
                                                        repeats=repeats)
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
+    if t_m is not None:
+        truth = replace(truth, t_m=np.tile(t_m, (len(truth.t_m), 1)))
     events = list(plan_events(truth, plan, settings=CellSettings(**settings), rng=rng,
                               start_ns=START_NS))
     kinds = [[e for e in events if isinstance(e, kind)]
