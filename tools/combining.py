@@ -12,9 +12,9 @@ import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Combination, Part, combine
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.parallel import check_workers, outcomes
 from selfcal_ros.simulation.machine import random_truth

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.parallel import check_workers, outcomes

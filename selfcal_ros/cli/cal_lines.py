@@ -18,7 +18,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
 if TYPE_CHECKING:
-    from selfcal_ros.aerotech.lines import AxisCorrection
+    from selfcal_ros.aerotech.export import AxisCorrection
     from selfcal_ros.compensation.frame import MachineFrame
     from selfcal_ros.model.result import CalibrationResult
 
@@ -197,7 +197,7 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 
 def _orthogonality(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech import lines as cal_lines
+    from selfcal_ros.aerotech import export as cal_lines
     from selfcal_ros.compensation.frame import UNITS_M
     from selfcal_ros.results import read_result
 
@@ -250,7 +250,7 @@ def _straightness(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace, corrected: Axis) -> int:
-    from selfcal_ros.aerotech import lines as cal_lines
+    from selfcal_ros.aerotech import export as cal_lines
     from selfcal_ros.files import read_text
     from selfcal_ros.results import read_result
 
@@ -283,8 +283,7 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from datetime import UTC, datetime
 
     from selfcal_ros import __version__
-    from selfcal_ros.aerotech.export import DECIMALS
-    from selfcal_ros.aerotech.lines import line_table
+    from selfcal_ros.aerotech.export import DECIMALS, line_table
     from selfcal_ros.aerotech.write import cal_text, write_cal
     from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.cli.trace import command, outputs_of, record

@@ -157,7 +157,7 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
 
     The machine's home is counted from the start of the first block.
     """
-    from selfcal_ros.aerotech.lines import AxisCorrection, line_table
+    from selfcal_ros.aerotech.export import AxisCorrection, line_table
     from selfcal_ros.laser.profiles import axis_corrections
 
     lines = axis_corrections(found)

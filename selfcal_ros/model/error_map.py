@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated error map of the stage, with datum and uncertainty; NaN means unknown."""
+"""The calibrated error map of the stage, its uncertainty, and the modes of its datum.
+
+NaN means unknown. No view determines the modes (method eqs. 3.1-3.3); slopes of the half axes
+are those of eq. 3.7.
+"""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -63,3 +67,86 @@ class ErrorMap:
     def valid(self) -> np.ndarray:
         """Sites whose error is known, bool (nx, ny)."""
         return np.isfinite(self.gx) & np.isfinite(self.gy)
+
+
+def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
+    """Return the rigid modes of a map, (modes, 2, nx, ny): two translations, rotation, scale.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Lattice of the map.
+    scale : bool
+        Whether magnification belongs to the datum (stage: yes, plate: no).
+    """
+    x, y = artifact.x_m, artifact.y_m
+    one, zero = np.ones(artifact.shape), np.zeros(artifact.shape)
+    modes = [(one, zero), (zero, one), (-y, x)]
+    return np.array([*modes, (x, y)] if scale else modes)
+
+
+def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Return `field_m` (2, nx, ny) minus its least-squares part in `modes`, over known sites.
+
+    Sites with NaN stay NaN and are ignored. With the modes of `datum_modes` the result
+    satisfies Hu eq. 5 (stage) or eq. 11 (plate).
+    """
+    known = np.isfinite(field_m).all(axis=0)
+    basis = modes[:, :, known].reshape(len(modes), -1).T
+    basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
+    coefficients = np.linalg.lstsq(basis, field_m[:, known].ravel(), rcond=None)[0]
+    out = field_m.copy()
+    out[:, known] -= (basis @ coefficients).reshape(2, -1)
+    return out
+
+
+def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
+    """Return the slopes of the XY error along the half axes +X, +Y, -X, -Y, rad (Hu eq. 27).
+
+    They are the angular errors at lines 0, K/4, K/2, 3K/4: ordinary least squares with
+    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN if a half axis has only one site.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Lattice of the map.
+    g_m : float array (2, nx, ny, ...)
+        XY error, m; further axes are kept.
+    """
+    hx, hy = artifact.half
+    along = (g_m[1, hx + 1:, hy], -g_m[0, hx, hy + 1:], g_m[1, :hx, hy], -g_m[0, hx, :hy])
+    return np.stack([_slope(line, artifact.grid_pitch_m) for line in along])
+
+
+def _slope(values: np.ndarray, pitch_m: float) -> np.ndarray:
+    """Return the slope of equidistant values (n, ...) along their first axis."""
+    n = len(values)
+    if n < 2:
+        return np.full(values.shape[1:], np.nan)
+    steps = (np.arange(1, n + 1) - (n + 1) / 2) * pitch_m
+    return np.tensordot(steps / (steps @ steps), values, axes=1)
+
+
+def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the slopes of `half_axis_slopes` as rows over the sites, complex (4, nx, ny).
+
+    The row of a half axis with fewer than two known sites is zero.
+
+    Parameters
+    ----------
+    z_m : complex array (nx, ny)
+        Site positions, m.
+    known : bool array (nx, ny)
+        Sites to use.
+    """
+    hx, hy = (size // 2 for size in z_m.shape)
+    out = np.zeros((4, *z_m.shape), dtype=complex)
+    halves = ((np.s_[hx + 1:, hy], 1j), (np.s_[hx, hy + 1:], -1), (np.s_[:hx, hy], 1j),
+              (np.s_[hx, :hy], -1))
+    for row, (part, unit) in zip(out, halves, strict=True):
+        good = known[part]
+        if good.sum() >= 2:
+            at = (z_m[part].real + z_m[part].imag) * good
+            centred = (at - at.sum() / good.sum()) * good
+            row[part] = unit * centred / (centred @ centred)
+    return out

@@ -1,19 +1,137 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pose_sequencer: commands the views of a plan."""
+"""pose_sequencer: commands the views of a plan, alone or as the action run_calibration."""
 
 import sys
+import time
 from functools import partial
 from typing import Any
 
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.task import Future
+from selfcal_msgs.action import RunCalibration
+from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
+from selfcal_ros.collection.sequencer import State
 from selfcal_ros.collection.settings.nodes import SequencerSettings
+from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.calibration_action import CalibrationAction
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.sequencing import SequencingSession
+from selfcal_ros.sessions.compensating import plan_file_name
+from selfcal_ros.sessions.health import Level
+from selfcal_ros.sessions.sequencing import SequencingSession, load_plan
+
+
+class CalibrationAction:
+    """Serve run_calibration for a sequencer: one goal at a time.
+
+    Parameters
+    ----------
+    node : ManagedNode
+        The sequencer's node, during activation.
+    session : SequencingSession
+        Runs the plan.
+    """
+
+    def __init__(self, node: ManagedNode[SequencerSettings], session: SequencingSession) -> None:
+        self._node, self._session = node, session
+        self._goal: Any = None
+        self._ended: Future | None = None
+        self._saved: Future | None = None
+        self._save_until = 0.0
+        session.on_end = self._on_end
+        self._saver = node.own(node.create_client(SaveMap, "solver/save_map"),
+                               node.destroy_client)
+        node.own(ActionServer(
+            node, RunCalibration, "~/run_calibration", self._execute,
+            goal_callback=self._on_goal, cancel_callback=lambda goal: CancelResponse.ACCEPT),
+            ActionServer.destroy)
+
+    def tick(self) -> None:
+        """Give feedback; handle a cancelled goal and a solver that does not answer."""
+        if self._goal is None:
+            return
+        if self._goal.is_cancel_requested and not self._session.ended:
+            self._session.give_up()
+        if self._saved is not None and time.monotonic() > self._save_until:
+            _complete(self._saved)
+        view = self._session.current
+        if view is not None:
+            self._goal.publish_feedback(RunCalibration.Feedback(
+                view=view.name, view_index=self._session.machine.index,
+                coverage=self._session.coverage))
+
+    def _on_goal(self, _: Any) -> GoalResponse:
+        if self._session.ended and self._goal is None:
+            return GoalResponse.ACCEPT
+        self._node.say(Level.WARN, f"goal rejected while {self._session.machine.state}: abort the "
+                       "plan first")
+        return GoalResponse.REJECT
+
+    def _on_end(self) -> None:
+        if self._ended is not None:
+            _complete(self._ended)
+
+    def _on_saved(self, _: Future) -> None:
+        if self._saved is not None:
+            _complete(self._saved)
+
+    async def _execute(self, goal: Any) -> Any:
+        """Run the plan of a goal to its end and have the solver save the map."""
+        result = RunCalibration.Result()
+        try:
+            if goal.request.plan_path:
+                self._session.machine.plan = load_plan(goal.request.plan_path)
+            self._goal, self._ended = goal, Future()
+            self._session.begin()
+            await self._ended
+            await self._conclude(goal, result)
+        except Exception as error:
+            code, result.message = as_answer(error)
+            result.error_code = int(code)
+            goal.abort()
+        finally:
+            self._goal, self._ended = None, None
+        return result
+
+    async def _conclude(self, goal: Any, result: Any) -> None:
+        machine = self._session.machine
+        if machine.state is not State.DONE:
+            result.error_code = int(ExitCode.NO_DATA)
+            result.message = f"the plan was not measured to its end: {machine.state}"
+            goal.canceled() if goal.is_cancel_requested else goal.abort()
+            return
+        answer = await self._save(
+            self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id))
+        result.error_code, result.message = answer.error_code, answer.message
+        result.map_path = answer.path
+        goal.succeed() if answer.success else goal.abort()
+
+    async def _save(self, path: str) -> Any:
+        """Return the solver's answer; NoDataError after a time-out."""
+        if not self._saver.service_is_ready():
+            raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
+        patience = self._node.settings.save_timeout
+        self._saved, self._save_until = Future(), time.monotonic() + patience
+        answer = self._saver.call_async(SaveMap.Request(path=path))
+        answer.add_done_callback(self._node.guarded(self._on_saved))
+        try:
+            await self._saved
+        finally:
+            self._saved = None
+        if not answer.done():
+            self._saver.remove_pending_request(answer)
+            raise NoDataError("run_calibration", f"the solver has not saved the map in {patience:g}"
+                              " s", "look at the solver, then call save_map")
+        return answer.result()
+
+
+def _complete(future: Future) -> None:
+    if not future.done():
+        future.set_result(None)
+
 
 COMPANIONS = ("measurement_collector", "solver")
 TICK_S = 0.05

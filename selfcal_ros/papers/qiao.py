@@ -8,14 +8,13 @@ from math import pi
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ThetaDatum, rms
+from selfcal_ros.model.error_map import ThetaDatum, datum_modes, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.papers.readings import grid_deviation, simulate_measurements

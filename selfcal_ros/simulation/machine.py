@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.modes import datum_modes, half_axis_slopes, remove_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, half_axis_slopes, remove_modes
 from selfcal_ros.model.view import View
 
 WALK_STEPS = 256

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
-from selfcal_ros.aerotech.lines import (
+from selfcal_ros.aerotech.export import (
     length_m,
     line_table,
     map_line,

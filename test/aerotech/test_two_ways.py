@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.aerotech.export import DECIMALS, table_theta, table_xy, theta_decimals
-from selfcal_ros.aerotech.lines import AxisCorrection, line_table
+from selfcal_ros.aerotech.export import (
+    DECIMALS,
+    AxisCorrection,
+    line_table,
+    table_theta,
+    table_xy,
+    theta_decimals,
+)
 from selfcal_ros.aerotech.model import Unit, UnitWord
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.verify import plane_correction, setup_of

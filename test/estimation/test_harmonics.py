@@ -14,8 +14,7 @@ from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
+from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.rank import best_turn_deg
 from selfcal_ros.estimation.options import Options

@@ -117,7 +117,7 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
 
 
 @pytest.mark.parametrize(("data", "message"), [
-    (None, "f: not a mapping of keys to values; see config/plans"),
+    (None, "f: not a mapping of keys to values; see the examples in config"),
     ({}, "f: the key 'plan_id' is missing; add it"),
     (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views, visit"),
     (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import _stage

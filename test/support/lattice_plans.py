@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan, View
 from test.support.truth import Truth, random_truth, simulate_measurements

@@ -3,9 +3,8 @@
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, datum_modes
 from selfcal_ros.model.result import ArtifactMap, CalibrationResult, Noise, Observability
 from test.support.truth import random_truth
 

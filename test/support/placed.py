@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View
 

@@ -15,9 +15,8 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import parse_terms

@@ -16,7 +16,6 @@ from selfcal_ros.estimation.comparison.covariance import (
     xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import require_same_lattice
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.joint.noise import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -26,7 +25,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     remaining_part,
 )
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.result import (
     COMBINED,
     ArtifactMap,

@@ -19,10 +19,9 @@ from selfcal_ros.estimation.comparison.together import (
     plate_covariance,
     plate_theta_covariance,
 )
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import MANY_DOF, rms
+from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.units import MM_PER_M
 

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.modes import slope_rows
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
-from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.readings import Sense
 
 MISCLOSURE_LEVEL = 0.05

@@ -12,9 +12,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from selfcal_ros.estimation.datum.modes import half_axis_slopes
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.error_map import ThetaDatum, half_axis_slopes
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from selfcal_ros.estimation.lattice.readings import (
     in_field,
     pose_of,
 )
-from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
@@ -96,8 +96,6 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
 def lines_of(angular: Marks[float]) -> AngularSystem:
     """Return the equations of the angular readings."""
     if angular.harmonics and angular.poses:
-        from selfcal_ros.estimation.normal.harmonics import HarmonicSystem  # rarely needed
-
         return HarmonicSystem(angular.poses, angular.weight, angular.harmonics)
     return AngularSystem(angular.poses, angular.weight)
 

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.estimation.normal.angular import HarmonicSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.estimation.normal.systems import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability

@@ -15,9 +15,9 @@ import numpy as np
 
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.normal.angular import HarmonicSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inverse
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 

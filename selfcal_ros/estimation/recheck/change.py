@@ -19,12 +19,11 @@ from selfcal_ros.estimation.comparison.maps import (
     significance,
 )
 from selfcal_ros.estimation.comparison.together import Together, together
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.recheck.views import Gain
 from selfcal_ros.model.artifact import Artifact, Interpolation
-from selfcal_ros.model.error_map import MANY_DOF, rms
+from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult

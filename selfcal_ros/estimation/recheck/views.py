@@ -17,7 +17,7 @@ from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import LatticeViews
-from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
+from selfcal_ros.estimation.normal.angular import HarmonicSystem
 from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements

@@ -17,9 +17,8 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import GAP, grid_residuals
-from selfcal_ros.estimation.normal.harmonics import HarmonicSystem
 from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.result import CalibrationResult

@@ -11,8 +11,7 @@ from typing import TextIO
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
-from selfcal_ros.model.error_map import ErrorMap, rms
+from selfcal_ros.model.error_map import ErrorMap, datum_modes, remove_modes, rms
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 

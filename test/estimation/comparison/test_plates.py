@@ -9,8 +9,8 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.comparison.together import plate_covariance
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes
 from test.support import placed
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from test.support.plans import plan_of
 from test.support.truth import Spread, random_truth, simulate_measurements
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.visits import placings_of
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import with_sub_views
 from selfcal_ros.simulation.cell import CellSettings, plan_events

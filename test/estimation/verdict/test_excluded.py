@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes, remove_modes
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.reporting.summary.sections import error_section

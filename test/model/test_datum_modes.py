@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.datum.modes import half_axis_slopes, slope_rows
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import half_axis_slopes, slope_rows
 
 PLATE = Artifact(9, 0.005, 8, 7)  # rectangular
 
