@@ -148,12 +148,12 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
     `without`: observability and prediction without terms.
     """
     from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
-    from selfcal_ros.estimation.verdict.explanations import LEVEL
+    from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL
 
     terms = PlannedTerms(plan, model, assumed)
     seen = terms.told(without[0])
     joint = terms.predicted(without[1]) if seen.identifiable else None
-    return seen, joint, check_terms(terms, sizes, LEVEL)
+    return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
 def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,

@@ -156,7 +156,7 @@ def _cell(key: str, value: Any) -> str:
 
 
 ABOUT = ("stage", "serial_number", "operator")
-"""What a report begins with, and no reading tells."""
+"""Entries at the head of a report that the readings do not contain."""
 
 
 def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
@@ -218,11 +218,11 @@ def provenance_section(result: CalibrationResult) -> Section:
     return Section("Provenance", tuple(facts))
 
 
-AT_NODES = ("At the nodes: how well the map itself is known. Take it to compare two calibrations, "
+AT_NODES = ("At the nodes: how well the map itself is known. Use it to compare two calibrations, "
             "and for positions that are nodes.")
 ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, which the curvature of "
-            "the map tells. Take it for what a corrected machine does at any position; a finer "
-            "plate makes it smaller.")
+            "the map tells. Use it for the positions of a corrected machine anywhere; a finer "
+            "plate reduces it.")
 
 
 @dataclass(frozen=True)
@@ -267,8 +267,8 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
             (plan_figure(result.plate, views_in(result)) if result.views else None,
-             "The plate as the plan lays it; the arrow leads the corner from where it is without a "
-             "turn.")), (sections.measurement_section(result), sections.views_section(result))),
+             "The plate as the plan places it; the arrow shows how far its marked corner has "
+             "turned.")), (sections.measurement_section(result), sections.views_section(result))),
         Chapter("Details", sections=tuple(extra_sections(result.extra))),
         Chapter("How to read the numbers", sections=(convention_section(result),
                                                      provenance_section(result)))]
@@ -293,8 +293,8 @@ def _causes(result: CalibrationResult) -> Chapter:
             printable(advice(cause))))
     header = ("cause", "what the readings show", "size", "u", "unit", "p", "remedy")
     return Chapter("Verdict, drift and causes", _figures(
-        (drift_found(result), "What the term drift took off the readings: the plate against the "
-                              "microscope, within each view.")), (
+        (drift_found(result), "The drift that the term removed from the readings: plate relative "
+                              "to microscope, within each view.")), (
         Section("Verdict", (("verdict", printable(verdict.sentence)),) if verdict.sentence else (),
                 notes=tuple(f"failed: {printable(reason)}" for reason in verdict.reasons)),
         Section("Likely causes, the most likely first", table=(header, *rows) if rows else ()),
@@ -373,13 +373,13 @@ def _where(budget: Budget) -> str:
 def _residuals(result: CalibrationResult) -> Chapter:
     found = residuals_in(result)
     pairs = (
-        (residual_maps(result, found), "What the fit leaves at each mark. Random directions are "
+        (residual_maps(result, found), "Residuals of the fit at each mark. Random directions are "
          "noise; neighbours that point the same way are an effect outside the model."),
         (distributions(found, "xy"), "Bars against the normal curve of the same rms, and the same "
          "residuals against normal quantiles: dots off the line at its ends are outliers."),
         (distributions(found, "theta"), "The same of the angular lines."),
         (courses(found, result.noise.sigma_xy), "Means over a sixtieth of the view's time each. A "
-         "course that leaves the band is a drift."))
+         "curve that leaves the band is a drift."))
     return Chapter("Residuals", _figures(*pairs))
 
 

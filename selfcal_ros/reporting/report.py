@@ -130,10 +130,10 @@ def page(title: str, body: str, *, style: str = "") -> str:
 
 
 WIDE = 40
-"""Characters from which a cell of words is given room."""
+"""Length of text from which a cell gets extra width."""
 
 SHORT = 24
-"""Characters up to which a cell of words is kept in one line."""
+"""Length of text up to which a cell does not wrap."""
 
 
 def report_html(result: CalibrationResult, found: Sequence[Chapter], head: Section) -> str:

@@ -17,7 +17,7 @@ from selfcal_ros.model.error_map import MANY_DOF
 
 INDEPENDENT = 1e-6
 """Length of a unit shape outside of those before it, below which it is not one of its own."""
-LEVEL = 0.05
+RUNS_LEVEL = 0.05
 """Probability that a run stands out, or a part between runs seems to exist, by chance."""
 TINY = np.finfo(float).tiny
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.between import LEVEL, Deviation, Mean, Run, mean_of
+from selfcal_ros.estimation.comparison.between import RUNS_LEVEL, Deviation, Mean, Run, mean_of
 from selfcal_ros.estimation.comparison.covariance import (
     COVARIANCE,
     theta_covariance,
@@ -263,7 +263,7 @@ def _extra(parts: Sequence[Part], xy: tuple[np.ndarray, Mean],
     facts: dict[str, Any] = {"u_between_m": mean.u_between, "p_between": mean.p_between}
     if angular is not None:
         facts |= {"u_between_rad": angular.u_between, "p_between_theta": angular.p_between}
-    limit = LEVEL / len(parts)
+    limit = RUNS_LEVEL / len(parts)
     facts["runs"] = [{
         "file": part.name, "run_id": part.result.run_id if part.result else "",
         "sha256": part.result.input.get("sha256", "") if part.result else "",
@@ -298,7 +298,7 @@ def _verdict(parts: Sequence[Part], mean: Mean, angular: Mean | None) -> Verdict
     enlarged: dict[str, Enlargement] = {}
     failed = []
     for found, kind, unit in ((mean, "xy", "m"), (angular, "theta", "rad")):
-        if found is not None and found.p_between < LEVEL:
+        if found is not None and found.p_between < RUNS_LEVEL:
             u = np.sqrt(found.between)
             name = BETWEEN if unit == "m" else f"{BETWEEN}_theta"
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)

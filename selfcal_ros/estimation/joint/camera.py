@@ -19,7 +19,7 @@ from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import TermName
 
-LEVEL = 1e-3
+DEGREE_LEVEL = 1e-3
 """Level of the test that a polynomial of a higher degree fits the cells better."""
 POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
@@ -163,7 +163,7 @@ def _polynomial(place: np.ndarray, error: np.ndarray,
         both = np.concatenate([drawn.real, drawn.imag], axis=1)
         value, (k, n) = np.concatenate([added.real, added.imag]), both.shape
         squares = value @ np.linalg.solve(both.T @ both / k, value)
-        if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < LEVEL:
+        if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < DEGREE_LEVEL:
             powers, fit = more, wider
     return powers, fit
 

@@ -165,20 +165,20 @@ def angular_part(problem: Problem) -> AngularPart:
 
 
 FAR = 0.02
-"""Distance from the sites, in pitches (rms), up to which the noise of the map stays what it is."""
+"""Distance from the sites, in pitches (rms), up to which the noise of the map is unaffected."""
 
 SAMPLES = 1000
 """Fewest sites of all draws of noise together: enough for a ratio of sums of squares."""
 
 STEPS = 30
-"""Most steps to the map of a draw."""
+"""Largest number of iterations for the map of a draw."""
 
 SETTLED = 1e-2
-"""Change of the map of a draw, relative to its size, that counts as none."""
+"""Relative change of the map of a draw below which it has converged."""
 
 
 class Moving:
-    """What the readings have because the stage stood off the sites, step by step.
+    """Contribution of stops off the sites to the readings, updated at each iteration.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ class Moving:
         """Stage error where the stage stood less that at the site, at each reading, m."""
 
     def taken(self, field: np.ndarray) -> np.ndarray | float:
-        """Return what the readings have because of it, (views, nx, ny), m; keep its change."""
+        """Return that contribution, (views, nx, ny), m, and store its change."""
         if self.places is None:
             return 0.0
         before: np.ndarray | float = 0.0 if self.moved is None else self.moved
@@ -203,7 +203,7 @@ class Moving:
         return self.places.changes(self.moved, self.problem.turn_rad)
 
     def ground(self, found: JointFit) -> TermInputs:
-        """Return the ground with visits less what the stage error differs by between them."""
+        """Return the inputs with visits corrected for differences of the stage error."""
         ground = self.problem.ground
         if self.places is None or self.moved is None:
             return ground
@@ -214,7 +214,7 @@ class Moving:
             for view, more in zip(ground.visits, about, strict=True)))
 
     def repeats(self, found: JointFit) -> tuple[float, float]:
-        """Return (sigma, dof) of the repeats without what the stage error differs by."""
+        """Return (sigma, dof) of the repeats, corrected for differences of the stage error."""
         sigma, dof = self.problem.repeats_xy
         less = (squares_within(self.problem.ground.visits)
                 - squares_within(self.ground(found).visits))

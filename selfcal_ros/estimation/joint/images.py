@@ -50,7 +50,7 @@ class TwoNoises:
 
 @dataclass(frozen=True, eq=False)
 class FittedYaw:
-    """The yaw of the stage fitted to what grid readings leave.
+    """The yaw of the stage fitted to the residuals of grid readings.
 
     Attributes
     ----------

@@ -180,7 +180,7 @@ def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, 
 
 
 def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
-    """Return the solution for the sizes as they are; see `fit_model`."""
+    """Iterate to the solution with the present sizes; see `fit_model`."""
     state = _State(problem)
     if state.equations is not None:
         check(state.equations)
@@ -210,7 +210,7 @@ def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelF
 
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
                  reduced: ReducedColumns | None = None) -> TermEquations:
-    """Return the equations of columns beside the estimate `found`."""
+    """Return the equations of columns about the estimate `found`."""
     if reduced is None:
         reduced = reduce_columns(problem.system.grid, columns.shapes)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
@@ -221,7 +221,7 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
 
 
 class _State:
-    """Where the iteration stands."""
+    """State of the iteration."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.steps, self.theta = problem, 0, angular_part(problem)
@@ -260,7 +260,7 @@ class _State:
         self._linearise(columns, reduced)
 
     def _anew(self, before: TermColumns) -> TermColumns:
-        """Return the columns with the visits, and offsets free of their noise, as they are now."""
+        """Return the columns for the present visits and noise-free offsets."""
         ground = without_noise(self.moving.ground(self.found), self.found.residuals,
                                before.at_visits(self.coefficients))
         columns = made_anew(ground, self.microscope, before, moved=self.problem.moves)
@@ -275,7 +275,7 @@ class _State:
         return columns
 
     def _stale(self, equations: TermEquations) -> bool:
-        """Return whether the angular readings now weigh otherwise than in the equations."""
+        """Return whether the weights of angular readings differ from those in the equations."""
         now, then = self.found.inverse, self.weights
         if len(equations.columns.lines.at) and (
                 abs(self.found.ratio - self.ratio) > LINEAR * self.ratio):
@@ -391,7 +391,7 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
 
 
 def with_noise(problem: Problem, sums: Sums) -> Problem:
-    """Return the problem with the noise that terms leave, of residuals and of visits."""
+    """Return the problem with the noises of residuals and visits after the terms."""
     within = sums.dof_within >= 1
     repeats = sigma_of(sums.within, sums.dof_within) if within else problem.repeats_xy
     return replace(problem, residuals_xy=sigma_of(sums.between, sums.dof_between),

@@ -29,8 +29,8 @@ from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
 
-LEVEL = 1e-3
-"""Probability that a good set of readings exceeds its limit."""
+PREDICTION_LEVEL = 1e-3
+"""Probability that the prediction error of good readings exceeds its limit."""
 
 DRAWS = 200
 """Number of draws in a small field: 10 % uncertainty of the degrees of freedom."""
@@ -183,9 +183,9 @@ class PredictionLimit:
     dof: float
 
     def ratio(self, noise_dof: float) -> float:
-        """Return the ratio of error to noise that is exceeded with probability LEVEL."""
+        """Return the ratio of error to noise that is exceeded with probability PREDICTION_LEVEL."""
         dof = min(noise_dof, MANY_DOF)
-        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - LEVEL)))
+        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - PREDICTION_LEVEL)))
 
 
 def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,

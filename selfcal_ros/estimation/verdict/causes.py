@@ -16,7 +16,7 @@ from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import TermInputs
-from selfcal_ros.estimation.verdict.explanations import FLOOR_M, LEVEL, Explanation
+from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, FLOOR_M, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Artifact
@@ -123,7 +123,7 @@ def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
             continue
         ratio = sigma / others
         p = float(fdtrc(dof, rest, ratio**2)) * len(views)
-        if p < LEVEL and ratio > NOISY:
+        if p < CAUSE_LEVEL and ratio > NOISY:
             u = float(ratio * np.sqrt((1 / dof + 1 / rest) / 2))
             found.append(Cause("noise", float(ratio), u, "m/m", p, name))
     return found

@@ -174,7 +174,7 @@ class Candidates:
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
 
 
-LEVEL = 5e-4
+CAUSE_LEVEL = 5e-4
 """Level of the test of each term, all parts of it that are tried together."""
 
 MAX_CAUSES = 4
@@ -338,7 +338,8 @@ def select_explanations(pool: Candidates, groups: list[Group],
         fitted = pool.explain_each([taken | group.rows for group in groups])
         tests = [(_test(pool, before, after, group), group)
                  for after, group in zip(fitted, groups, strict=True)]
-        good = [(test, group) for test, group in tests if test is not None and test[0] < LEVEL]
+        good = [(test, group) for test, group in tests
+                if test is not None and test[0] < CAUSE_LEVEL]
         if not good:
             break
         best = max(good, key=lambda item: item[0][1])[1]
@@ -365,7 +366,7 @@ def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) ->
         return False
     before, after = pool.explain_each([taken | group.rows, taken | group.rows | best.rows])
     more = _test(pool, before, after, best)
-    return more is None or more[0] >= LEVEL
+    return more is None or more[0] >= CAUSE_LEVEL
 
 
 def _test(pool: Candidates, before: Explained, after: Explained,

@@ -50,7 +50,7 @@ SIGN_U = 0.3
 show the sign of the offsets."""
 
 HIDDEN = 1e-3
-"""Share of the scale in a combination that no reading shows above which it is unknown."""
+"""Share of the scale in an unobservable combination above which the scale is unknown."""
 
 UNEXPLAINED = 1.5
 """Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which

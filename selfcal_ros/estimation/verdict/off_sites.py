@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the stage stood so far off the sites that its error there is not known.
+"""Test whether the stage stopped so far from the sites that its error there is unknown.
 
 A reading contains the stage error at the position of the stage (method eq. 7.10), and the map gives
 it between its sites by a spline. Two splines through the sites differ if the stage is rough from

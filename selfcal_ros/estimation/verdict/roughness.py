@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the nodes of a map suffice for the stage, and what they leave out.
+"""Test whether the nodes of a map resolve the stage's errors, and size the lack of fit.
 
 Between its nodes a map is a spline, and a stage that is rougher has more than that. A spline with
 twice as many intervals contains the map's; with the same readings it must not fit significantly
@@ -27,7 +27,7 @@ from selfcal_ros.model.verdict import Cause
 NAME = "roughness"
 """Name of the cause, and of the effect."""
 
-LEVEL = 1e-3
+ADEQUACY_LEVEL = 1e-3
 """Probability that a map that suffices fails the test."""
 
 MAX_COEFFICIENTS = 31 * 31
@@ -79,7 +79,7 @@ class Adequacy:
     @property
     def cause(self) -> Cause | None:
         """The cause `roughness`, if the map does not suffice."""
-        if not self.p < LEVEL:
+        if not self.p < ADEQUACY_LEVEL:
             return None
         size: dict[str, Any] = {"harmonics": self.nodes[0]} if self.of_lines else {
             "nodes": list(self.nodes)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for effects that the model does not hold; their bounds are added to the uncertainty.
+"""Search the residuals for unmodelled effects, and add bounds on them to the uncertainty.
 
 A term that the readings show joins the model with the largest size that they allow (method
 eq. 7.9), until they show no more. A cause that is no term (a slip, a single reading, a stage off
@@ -30,7 +30,7 @@ from selfcal_ros.estimation.verdict.causes import (
     turned_too_far,
 )
 from selfcal_ros.estimation.verdict.explanations import (
-    LEVEL,
+    CAUSE_LEVEL,
     Explanation,
     find_explanations,
 )
@@ -58,14 +58,14 @@ MATTERS = 0.1
 determine fully is ignored."""
 
 MAX_JOINED = 4
-"""Largest number of terms that join the model because the readings show them."""
+"""Largest number of terms added to the model because the readings show them."""
 
 START: dict[str, float] = {
     TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
     TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
     TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10,
     TermName.YAW: 1e-9}
-"""Initial size of a term that joins: so small that the readings contradict it."""
+"""Initial size of an added term: so small that the readings contradict it."""
 
 PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
 """Largest plausible size of a term: a larger one is a fault."""
@@ -109,7 +109,7 @@ class _Search:
 
 def search_causes(solved: Solved, measurements: Measurements, options: Options, *,
               failed: bool, advise: bool = True) -> SearchResult:
-    """Search for effects that the model does not hold.
+    """Search the residuals for effects that are not in the model.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         return SearchResult(solved)
     sizes = [test for test in solved.model.sizes if test.contradicted]
     place = None if measurements.artifact.map_grid else off_sites_cause(
-        solved.model, solved.result.error_map, LEVEL)
+        solved.model, solved.result.error_map, CAUSE_LEVEL)
     failed = failed or bool(sizes or place)
     found = _Search(solved)
     system, direct = solved.model.problem.system, solved.model.problem.direct
@@ -246,7 +246,7 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
 
 
 def _search(found: _Search, measurements: Measurements, options: Options, *, failed: bool) -> None:
-    """Let terms join while the readings show any; then bound the effects of all other causes."""
+    """Add terms while the readings show any; then bound the effects of all other causes."""
     left: list[Explanation] = []
     for _ in range(MAX_JOINED + 1):
         left = _explanations(found.solved, failed=failed)
@@ -256,7 +256,7 @@ def _search(found: _Search, measurements: Measurements, options: Options, *, fai
         failed = False
     for item in left:
         _bound(found, item, measurements)
-    if (line := line_cause(_model(found.solved).problem, measurements, LEVEL)) is not None:
+    if (line := line_cause(_model(found.solved).problem, measurements, CAUSE_LEVEL)) is not None:
         found.causes.append(line)
         found.effects.append(effect_of_line(line, measurements.artifact))
     if not found.causes:
@@ -303,7 +303,7 @@ def solved_with(measurements: Measurements, options: Options,
 
 def _join(found: _Search, first: list[Explanation], measurements: Measurements,
           options: Options) -> bool:
-    """Let the first of equally good explanations join, and the others enlarge the uncertainty.
+    """Add the first of equally good explanations to the model; the others enlarge u.
 
     Return whether it joined.
     """
@@ -368,7 +368,7 @@ def _as_a_microscope(found: _Search, measurements: Measurements, options: Option
 
 
 def _bound(found: _Search, item: Explanation, measurements: Measurements) -> None:
-    """Add a cause that did not join, with its effect on the map as far as that is determined."""
+    """Add a cause outside the model, with its effect on the map as far as determined."""
     model = _model(found.solved)
     cause = cause_of(item, model.problem.ground)
     if cause.name in [known.name for known in found.causes] and cause.name in START:

@@ -24,10 +24,10 @@ LEFT, TOP, SIDE = 58.0, 40.0, 336.0
 """Place and width of the vector map in its figure."""
 
 MAX_SPOTS = 31
-"""Sites along a side up to which a pointer shows their values."""
+"""Largest number of sites along a side that have tooltips."""
 
 ERRORS = {"stage": "G = indicated − true", "plate": "A = true − nominal"}
-"""Error of what a map is of."""
+"""Sign convention in the title of the map of a stage, and of a plate."""
 
 CENTRE: draw.Point = (240.0, 232.0)
 ZERO, ROOM = 112.0, 66.0
@@ -37,7 +37,7 @@ DRAWN = 720
 """Points of a circle between the lines of a Fourier series."""
 
 MARKED_LINES = 120
-"""Lines up to which each has a dot that shows a pointer its value."""
+"""Largest number of lines that have a dot with a tooltip each."""
 
 SCALE_AT = math.radians(22.5)
 """Where the radial scale is labelled."""
