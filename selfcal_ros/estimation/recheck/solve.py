@@ -261,8 +261,7 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
 
 def _misfit(seen: Seen, dof_noise: float) -> tuple[Finding, ...]:
     """Return whether the residuals are larger than noise and plate allow, if there are any."""
-    touched = (seen.gain.rows[:seen.known.size] != 0).any(axis=1).sum()
-    dof = len(seen.rest) - (2 * int(touched) + len(seen.parameters) - 3)
+    dof = seen.dof
     if dof <= 0:
         return ()
     square = float(seen.rest @ np.linalg.solve(seen.gain.noise, seen.rest))

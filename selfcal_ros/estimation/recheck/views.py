@@ -27,6 +27,9 @@ from selfcal_ros.model.terms import OF_LINES, TermName
 MOST_STEPS = 50
 """Most steps to the places of the stage and the rotations of the plate."""
 
+MOST_DATUMS = 12
+"""Most datums from that of the core to that of the known nodes."""
+
 STILL = 1e-13
 """Change of a reading, m, that is none."""
 
@@ -41,10 +44,13 @@ class Gain:
         What the estimate makes of a unit of each reading.
     noise : float array (r, r)
         Covariance of the readings for which it is the best.
+    free : float array (q,)
+        Variance that the prior leaves each unknown; 0 where the readings determine it.
     """
 
     rows: np.ndarray
     noise: np.ndarray
+    free: np.ndarray | float = 0.0
 
     @property
     def covariance(self) -> np.ndarray:
@@ -65,15 +71,18 @@ def least_squares(design: np.ndarray, noise: np.ndarray, held: np.ndarray,
     held : float array (q, k)
         Orthonormal combinations of the unknowns.
     vague : float
-        Information on every unknown, relative to the mean.
+        Information on every unknown, relative to the mean. What the readings do not determine has
+        no rows, as if it were 0: `free` tells it.
     """
     root = np.linalg.cholesky(noise)
     white = solve_triangular(root, design, lower=True)
     normal = white.T @ white
     size = np.trace(normal) / len(normal)
     normal[np.diag_indices(len(normal))] += vague * size
-    half = np.linalg.solve(normal + size * held @ held.T, white.T)
-    return Gain(solve_triangular(root, half.T, lower=True, trans="T").T, noise)
+    normal += size * held @ held.T
+    half = np.linalg.solve(normal, white.T)
+    free = vague * size * (np.linalg.inv(normal)**2).sum(axis=1) if vague else 0.0
+    return Gain(solve_triangular(root, half.T, lower=True, trans="T").T, noise, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +187,8 @@ class Seen:
         Of all nodes, x then y, and the misalignments, m.
     rest : float array (2 r,)
         Residuals.
+    dof : int
+        Their degrees of freedom.
     """
 
     known: np.ndarray
@@ -185,6 +196,7 @@ class Seen:
     parameters: np.ndarray
     gain: Gain
     rest: np.ndarray
+    dof: int
 
 
 def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
@@ -214,24 +226,29 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
     design = np.hstack([complex_design(fields), stacked(readings.of_misalignments())])
     touched = (np.abs(fields) > 0).any(axis=0).reshape(views.z_sites.shape)
     placed = not isinstance(views, LatticeViews)
-    known, z = touched, views.z_sites
+    known, z, strict = touched, views.z_sites, 2 - 2 * placed
     if placed:
         known = touched & (np.maximum(abs(z.real), abs(z.imag)) < CORE)
     columns = np.concatenate([np.tile(touched.ravel(), 2), np.ones(
         design.shape[1] - 2 * z.size, dtype=bool)])
     spread = np.tile(1 / readings.weight, 2)
-    for last in (False, False, True) if placed else (True,):
-        if known.sum() < 3 or (last and known.sum() < touched.sum() / 2):
-            left = int((~known).sum())
-            raise NotIdentifiableError(
-                f"a view of the known plate that leaves {left} of {known.size} nodes of the map "
-                "unknown: measure more of its marks", Observability(
-                    2 * int(known.sum()), 2 * known.size, 2 * left, False))
+    unit = (np.diag(noise) / spread).min()
+    for _ in range(MOST_DATUMS):
+        if known.sum() < 3 or (strict == 2 and known.sum() < touched.sum() / 2):
+            break
         gain = _in_datum(design, noise, z, known, columns, VAGUE * placed)
-        if not last:
-            u2 = (gain.rows[:2 * z.size] ** 2 @ spread).reshape(2, *z.shape)
-            known = touched & (u2 < KNOWN**2).all(axis=0)
-    return _converged(readings, design, gain, known, known_parts=(plate, microscope))
+        if strict == 2:
+            return _converged(readings, design, gain, known, known_parts=(plate, microscope))
+        u2 = (gain.rows ** 2 @ spread + gain.free / unit)[:2 * z.size].reshape(2, *z.shape)
+        u2, best = u2.max(axis=0), u2.max(axis=0)[touched].min()
+        strict += int(best < KNOWN**2)
+        # if the core itself has nodes that are not determined: the datum of the better ones
+        known = touched & (u2 < (KNOWN**2 if best < KNOWN**2 else 4 * best))
+    left, fewer = int((~known).sum()), ", or give the map fewer nodes" * placed
+    raise NotIdentifiableError(
+        f"a view of the known plate that leaves {left} of {known.size} nodes of the map "
+        f"unknown: measure more of its marks{fewer}", Observability(
+            2 * int(known.sum()), 2 * known.size, 2 * left, False))
 
 
 def _in_datum(design: np.ndarray, noise: np.ndarray, z: np.ndarray, known: np.ndarray,
@@ -240,9 +257,9 @@ def _in_datum(design: np.ndarray, noise: np.ndarray, z: np.ndarray, known: np.nd
     basis = np.zeros((design.shape[1], 3))
     basis[:2 * z.size] = stacked(Gauge(z, known, scale=False).orthonormal)
     found = least_squares(design[:, columns], noise, basis[columns], vague)
-    rows = np.zeros((design.shape[1], len(noise)))
-    rows[columns] = found.rows
-    return Gain(rows, noise)
+    rows, free = np.zeros((design.shape[1], len(noise))), np.zeros(design.shape[1])
+    rows[columns], free[columns] = found.rows, found.free
+    return Gain(rows, noise, free)
 
 
 def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: np.ndarray, *,
@@ -267,7 +284,9 @@ def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: n
             moved = places.moved(field, near)
             taken = taken + places.changes(moved, problem.turn_rad)[at]
         if np.abs(taken - before).max() <= STILL:
-            return Seen(known, field, found[2 * n:], gain, right - design @ found)
+            told = round(float(np.einsum("ij,ji->", gain.rows, design)))
+            return Seen(known, field, found[2 * n:], gain, right - design @ found,
+                        len(right) - told)
     raise NotSettledError("recheck", "the rotations of the plate do not settle",
                           "check the readings for misalignments of more than a few degrees")
 

@@ -7,13 +7,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.change import known_plate
-from selfcal_ros.estimation.recheck.solve import recheck
+from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -107,9 +109,9 @@ def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(model, pose
                  rel=1e-5 if model == "none" else 1e-2)
 
 
-def general(pose, sigma=20e-9, seed=3, change=0.0):
+def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic"):
     """Readings of six general views, and of one more of a changed stage."""
-    rng, artifact = np.random.default_rng(seed), placed.plate(7, 5)
+    rng, artifact = np.random.default_rng(seed), placed.plate(7, 5, how)
     before, truth = placed.readings(artifact, placed.SIX, rng, linear=True, sigma=sigma)
     field = truth.field + change * rng.normal(size=truth.field.shape)
 
@@ -217,6 +219,43 @@ def test_what_one_view_cannot_tell_is_refused():
     before, few = general((0, (3.2, 3.1)))
     with pytest.raises(NotIdentifiableError, match=r"leaves .* of 25 nodes of the map unknown"):
         recheck(few, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+
+
+@pytest.mark.parametrize(("how", "gone", "free"), [
+    ("bicubic", lambda m, n: m > 5, 0),
+    ("bilinear", lambda m, n: np.maximum(abs(m), abs(n)) < 2, 1)])
+def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
+    """By the null space of the view's dense matrix, over the nodes without motion."""
+    before, after = general((4, (0.1, -0.1)), how=how)
+    view, artifact = after.views[0], after.artifact
+    kept = ~gone(view.m, view.n)
+    after = replace(after, views=(subset(view, kept, np.zeros(0, bool)),))
+    result = recheck(after, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+    m, n, valid = view.m[kept], view.n[kept], result.error_map.valid.ravel()
+    w = placed.rows(artifact, view.view.pose.places(artifact, m, n)) + 0j
+    turn = np.exp(1j * view.view.rotation_rad)
+    design = np.hstack([w, 1j * w, np.column_stack([turn * 1j * (m + 1j * n), 0 * m + 1, 0 * m + 1j
+                                                    ])])
+    null = null_space(np.vstack([design.real, design.imag]), rcond=1e-9)[:50]
+    modes = datum_modes(artifact.field, scale=False).reshape(3, -1).T
+    here = np.tile(valid, 2)
+    left = null - modes @ np.linalg.lstsq(modes[here], null[here], rcond=None)[0]
+    size = np.linalg.norm(left, axis=1).reshape(2, -1).max(axis=0)
+    assert size[valid].max() < 1e-7
+    assert (size > 1e-3).sum() >= free and 12 <= valid.sum() <= 24 - free
+
+
+def test_a_map_with_as_many_nodes_as_marks_needs_more_than_one_view():
+    """72 marks do not tell 81 nodes: the last column had the smallest u of all."""
+    rng, artifact = np.random.default_rng(4), placed.plate(9, 9)
+    before, _ = placed.readings(artifact, placed.SIX, rng, linear=True)
+    plate = known_plate(saved(calibrate(before, linear())), "r.json")
+    after, _ = placed.readings(artifact, [(0, (0.3, 0))], rng, linear=True)
+    planned = Plan("again", artifact, (after.views[0].view,))
+    for what in (lambda: recheck(after, linear(), plate), lambda: predict_recheck(planned, plate)):
+        with pytest.raises(NotIdentifiableError, match=r"leaves 54 of 81 nodes of the map unknown: "
+                                                       "measure more .*, or give the map fewer"):
+            what()
 
 
 def test_another_plate_does_not_fit_a_map_with_fewer_nodes_than_marks():
