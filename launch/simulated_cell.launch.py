@@ -22,9 +22,14 @@ def generate_launch_description() -> LaunchDescription:
                               "empty = do not record"),
         node("bag_recorder", {"bag": text("bag")},
              condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), ""))),
-        node("stage_simulator"),
+        DeclareLaunchArgument("camera", default_value="", description="SIM.yaml with a camera: "
+                              "the cell publishes images, mark_detector finds the marks in them; "
+                              "empty = detections"),
+        node("stage_simulator", {"camera": text("camera")}),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
-            launch_arguments={name: LaunchConfiguration(name)
-                              for name in (*SHARED, "journal")}.items()),
+            launch_arguments={**{name: LaunchConfiguration(name)
+                                 for name in (*SHARED, "journal")},
+                              "detect": NotEqualsSubstitution(
+                                  LaunchConfiguration("camera"), "")}.items()),
     ])

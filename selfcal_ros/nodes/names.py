@@ -23,6 +23,7 @@ from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
+from selfcal_ros.model.view import MAX_VIEWS
 from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 
@@ -54,7 +55,9 @@ NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, msg.ViewCommand, _qos(1, latched=Tr
 """Offered by a sequencer: a late cell acts on the first command that it receives."""
 STATUS = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64, latched=True))
 STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64))
-MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(64, latched=True))
+# one message a view, or a cell of its image; each is sent again when a view was redone
+MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(
+    2 * MAX_VIEWS, latched=True))
 ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, msg.ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic(topics.SUMMARY_TOPIC, msg.CalibrationSummary, _qos(1, latched=True))
 MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))

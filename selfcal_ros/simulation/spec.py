@@ -280,6 +280,20 @@ def read_simulation(path: str | Path) -> Simulation:
                       _placed(data.get("placed", []), plan, f"{where}: placed"), camera)
 
 
+def camera_of(path: str | Path) -> tuple[Camera, Spread]:
+    """Return the camera of a SIM.yaml and the sizes of its truth.
+
+    Raises
+    ------
+    InputError
+        If it has no camera, or cannot be read.
+    """
+    found = read_simulation(path)
+    if found.camera is None:
+        raise InputError(str(path), "the cell has no camera", "add the key 'camera'")
+    return found.camera, found.spread
+
+
 def _check_of_images(faults: Mapping[str, Any], where: str) -> None:
     """Refuse faults that images cannot have."""
     for name in PARTS:
@@ -293,9 +307,10 @@ def settings_of(values: Mapping[str, Any]) -> CellSettings:
     return CellSettings(**_fields_of(values, NOISE | CELL, CellSettings()))
 
 
-def spread_of(values: Mapping[str, Any]) -> Spread:
+def spread_of(values: Mapping[str, Any], default: Spread | None = None) -> Spread:
     """Return the parameters of a truth from the keys of ``truth`` and ``physics``."""
-    return Spread(**_fields_of(values, TRUTH | PHYSICS, Spread()))
+    default = default or Spread()
+    return replace(default, **_fields_of(values, TRUTH | PHYSICS, default))
 
 
 def _fields_of(values: Mapping[str, Any], keys: Section, defaults: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ SHARED = {"namespace", "params", "plan", "use_sim_time", "log_level", "foxglove"
 ARGUMENTS = {
     "calibrate.launch.py": SHARED | {"compensate", "detect", "journal"},
     "replay.launch.py": SHARED | {"bag", "rate"},
-    "simulated_cell.launch.py": SHARED | {"bag", "journal"},
+    "simulated_cell.launch.py": SHARED | {"bag", "camera", "journal"},
 }
 STARTED = {
     "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator",

@@ -24,7 +24,8 @@ from selfcal_ros.nodes import base, measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.units import NS_PER_S
-from test.support.plans import plan_of
+from test.support.collecting import scene
+from test.support.plans import image_plan, plan_of
 from test.support.ros import publish_events
 from test.support.sessions import collected, events_of, small_plan
 
@@ -63,6 +64,19 @@ def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
             graph.until(lambda p=publisher: p.get_subscription_count() == 1, "a match")
             publisher.publish(names.ENCODER.type(name=["x"], position=[1.0]))
     graph.until(lambda: node.session.collector.received["encoder"] == 2, "both samples")
+
+
+def test_a_late_listener_receives_every_cell_of_every_view(graph):
+    """Images of 7 x 7 marks: 98 measurements, which were published before it came."""
+    events = scene(image_plan(7, marks=7)).events
+    node = graph.node(MeasurementCollector)
+    early = graph.listen(names.MEASUREMENT)
+    counts = publish_events(graph, events)
+    graph.until(lambda: received(node, counts), "all messages")
+    assert graph.call(Trigger, FINISH).success
+    graph.until(lambda: len({m.view_name for m in early}) == 2 * 49, "all cells")
+    late = graph.listen(names.MEASUREMENT)
+    graph.until(lambda: {m.view_name for m in late} == {m.view_name for m in early}, "all again")
 
 
 def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):

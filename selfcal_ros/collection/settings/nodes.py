@@ -266,6 +266,7 @@ class SimulatorSettings(Settings):
     exposure_period: float = declared(0.01, "time between two exposures", "s", 0.001, 10.0)
     with_ids: bool = declared(True, "detections name their marks")
     truth_path: str = declared("", "JSON file for the known truth; empty = none")
+    camera: str = declared("", "SIM.yaml: camera for images, sizes of the truth; empty = none")
     declare_sigma: bool = declared(False, "detections state their standard deviation")
     servo_sigma: float = declared(2e-8, "scatter of the stage about its stop position", **_LENGTH)
     servo_sigma_theta: float = declared(1e-7, "the same of theta", **_ANGLE)
@@ -324,8 +325,7 @@ class SimulatorSettings(Settings):
         0.0, "bending of the plate in each view after the first, at mid-edge, standard deviation",
         **_LENGTH)
     plate_strain: float = declared(
-        0.0, "strain of the plate in each view after the first, standard deviation", "m/m", 0.0,
-        0.1)
+        0.0, "strain of the plate in views after the first, standard deviation", "m/m", 0.0, 0.1)
     plate_tilt: float = declared(
         0.0, "tilt of the plate in each view, standard deviation", **_ANGLE)
     plate_bow: float = declared(
