@@ -11,12 +11,12 @@ from scipy.linalg import null_space
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum.modes import datum_modes
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
