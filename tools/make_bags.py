@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import yaml
 
-from selfcal_ros.bagio.images.bags import ImageBag
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
 from selfcal_ros.cli.replay import domain, process
 from selfcal_ros.collection.settings.detector import DetectorSettings

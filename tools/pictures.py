@@ -19,8 +19,7 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.places import plan_figure
-from selfcal_ros.reporting.figures.svg import svg_file
-from selfcal_ros.reporting.report import chapters
+from selfcal_ros.reporting.report import chapters, svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.exposing import Exposure

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
         before = sum("key" in record and record["key"] in keys for record in records)
         if baseline is not None:
-            from selfcal_ros.batch.baseline import compared, sentence
+            from selfcal_ros.batch.course import compared, sentence
 
             records = compared(records, folder, baseline, args.baseline)
         found = series_of(records)

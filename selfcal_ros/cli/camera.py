@@ -90,7 +90,7 @@ def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
     """Return stage positions and marks of each image of a bag."""
     import numpy as np
 
-    from selfcal_ros.bagio.images.bags import ImageBag, encoder_track
+    from selfcal_ros.bagio.images import ImageBag, encoder_track
 
     stamps, track = encoder_track(args.bag)
     exposed, images = [], []
@@ -117,7 +117,7 @@ def _of_files(args: argparse.Namespace, detector: "ImageDetector",
     """Return stage positions and marks of each image of a folder."""
     import numpy as np
 
-    from selfcal_ros.bagio.images.files import read_positions
+    from selfcal_ros.bagio.images import read_positions
     from selfcal_ros.files import read_bytes
 
     positions, images = [], []

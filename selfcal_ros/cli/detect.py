@@ -67,7 +67,7 @@ def settings_of(args: argparse.Namespace) -> "DetectorSettings":
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    from selfcal_ros.bagio.images.bags import ImageBag
+    from selfcal_ros.bagio.images import ImageBag
     from selfcal_ros.bagio.offline import TRUTH_FILE
     from selfcal_ros.files import read_bytes, write_bytes
     from selfcal_ros.vision.exposures import ImageDetector
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str) -> "Counter[str]":
     """Write a bag from image files and a table of positions; return problems."""
-    from selfcal_ros.bagio.images.files import read_positions, write_pictures
+    from selfcal_ros.bagio.images import read_positions, write_pictures
     from selfcal_ros.errors import InputError
     from selfcal_ros.files import read_yaml
     from selfcal_ros.model.view import plan_from_dict

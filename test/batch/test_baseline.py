@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.batch.baseline import compared, probability, sentence
+from selfcal_ros.batch.course import compared, probability, sentence
 from selfcal_ros.batch.table import csv_text
 from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from selfcal_ros.bagio.images.bags import ImageBag
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.schemas import build, store_with
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main

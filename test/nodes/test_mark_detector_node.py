@@ -6,7 +6,7 @@ import pytest
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from selfcal_ros.bagio.images.bags import ImageBag
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main

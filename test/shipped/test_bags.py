@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal_ros.bagio.images.bags import ImageBag
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
