@@ -88,7 +88,7 @@ def _label(label: draw.Label) -> str:
     anchor = "" if label.anchor == "start" else f' text-anchor="{label.anchor}"'
     turned = f' transform="rotate(-90 {_n(x)} {_n(y)})"' if label.turned else ""
     return (f'<text class="{look}" x="{_n(x)}" y="{_n(y)}" font-size="{_n(label.size)}"{anchor}'
-            f'{turned}>{escape(printable(label.text))}</text>')
+            f"{turned}>{escape(printable(label.text))}</text>")
 
 
 def _n(value: float) -> str:
