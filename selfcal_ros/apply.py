@@ -50,8 +50,9 @@ class StageMap(Compensator):
                                        "the missing views", result.observability)
         grid = result.plate.map_grid
         whole = grid is not None and bool(result.error_map.valid.all())
-        own: Interpolation = grid.interpolation.value if grid and whole else "bilinear"
-        super().__init__(result.error_map, method=method or own, outside=outside)
+        fitted: Interpolation | None = grid.interpolation.value if grid else None
+        own: Interpolation = fitted if fitted and whole else "bilinear"
+        super().__init__(result.error_map, method=method or own, outside=outside, fitted=fitted)
         self.result = result
 
     def covariance(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
@@ -59,7 +60,8 @@ class StageMap(Compensator):
 
         That of the bilinear interpolation at true positions; outside the field, that of the nearest
         point of its edge. The variance of any combination a . (Gx, Gy), such as the distance of
-        two points, is a' C a. The stage error between its sites is not included.
+        two points, is a' C a. The error of interpolation between the sites, as in `uncertainty`, is
+        common to the points of a cell and independent between cells and between x and y.
 
         Raises
         ------
@@ -83,7 +85,18 @@ class StageMap(Compensator):
                              "sites", "solve again with uncertainties; fields beyond 31 x 31 "
                              "marks have none")
         both = np.kron(np.eye(2), weights[:, used])
-        return both @ sites @ both.T
+        cells = np.stack([self._cell(x, 0), self._cell(y, 1)])
+        alike = (cells[:, :, None] == cells[:, None, :]).all(axis=0)
+        cover = both @ sites @ both.T
+        for axis, more in enumerate(self._between(x, y)):
+            part = slice(axis * len(x), (axis + 1) * len(x))
+            cover[part, part] += alike * np.outer(more, more)
+        return cover
+
+    def _cell(self, p_m: np.ndarray, axis: int) -> np.ndarray:
+        """Return the cells of the grid along an axis in which positions lie, (P,)."""
+        half = self.error_map.artifact.half[axis]
+        return np.clip(np.floor(p_m / self._pitch + half), 0, 2 * half - 1)
 
     def length_error(self, first: tuple[ArrayLike, ArrayLike],
                      second: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
@@ -113,11 +126,17 @@ class StageMap(Compensator):
             u[part] = _along(cover, dx[part] / length[part], dy[part] / length[part])
         return np.hypot(dx + bx - ax, dy + by - ay) - length, u
 
-    def length_uncertainty(self) -> tuple[float, float]:
+    def length_uncertainty(self, *, anywhere: bool = True) -> tuple[float, float]:
         """Return a in m and b in m/m: U of a distance L in the field is at most a + b L.
 
-        Between nodes, with the coverage factor of the map, 95.45 %. Larger fields are judged at
-        every second, third, ... node.
+        With the coverage factor of the map, 95.45 %. Larger fields are judged at every second,
+        third, ... node.
+
+        Parameters
+        ----------
+        anywhere : bool
+            Whether the ends lie anywhere in the field: each halfway between nodes along x and y,
+            where the error of interpolation is largest. Otherwise both are nodes.
 
         Raises
         ------
@@ -142,6 +161,9 @@ class StageMap(Compensator):
             (ex**2, i, j), (ey**2, i + n, j + n)))
         square += 2 * ex * ey * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n]
                                  - cover[j, i + n])
+        if anywhere:
+            worst = self.halfway.sum(axis=1)
+            square += 2 * ((ex * worst[0])**2 + (ey * worst[1])**2)
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
         found = linprog([1.0, (length / length.max()).mean()], b_ub=-U / size, A_ub=-np.stack(

@@ -70,10 +70,28 @@ def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
         basis.append(np.concatenate(
             StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y)) / 1e-9)
     wanted = np.cov((draws @ np.array(basis)).T)
-    found = load(file).covariance(x, y)
+    stage = load(file)
+    stage.halfway = np.zeros((2, 2))  # a stage that is bilinear between its nodes
+    found = stage.covariance(x, y)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.05 * found.max())
     assert (np.sqrt(np.diag(found)) <= (1 + 1e-9) * np.concatenate(
-        load(file).uncertainty(x, y))).all()  # the bound of `uncertainty` holds
+        stage.uncertainty(x, y))).all()  # the bound of `uncertainty` holds
+
+
+def test_interpolation_adds_its_error_between_the_nodes(file, result):
+    """Nothing at a node, on an edge that along it, in the middle of a cell the sum of both."""
+    stage, pitch = load(file), result.artifact.grid_pitch_m
+    stage.halfway = np.zeros((2, 2))
+    x, y = np.array([0.0, 0.5, 0.5, 0.75, 0.5, 9.0]) * pitch, np.array(
+        [1.0, 1.0, 0.5, 1.5, -0.5, 0.5]) * pitch
+    plain, before = stage.covariance(x, y), stage.uncertainty(x, y)
+    stage.halfway = np.array([[3e-8, 3e-8], [0.0, 5e-8]])
+    added = np.array([[0, 3, 6, 5.25, 6, 3], [0, 0, 5, 5, 5, 5]]) * 1e-8
+    np.testing.assert_allclose(stage.uncertainty(x, y), np.hypot(before, added))
+    cells = [[a == b for a in "ABCBDE"] for b in "ABCBDE"]  # (0.5, 1) is in the cell of y = 1..2
+    wanted = plain + np.kron([[1, 0], [0, 0]], np.outer(added[0], added[0]) * cells) + np.kron(
+        [[0, 0], [0, 1]], np.outer(added[1], added[1]) * cells)
+    np.testing.assert_allclose(stage.covariance(x, y), wanted, atol=1e-22)
 
 
 def test_neighbours_share_their_uncertainty(file, result):
@@ -100,7 +118,7 @@ def test_the_error_of_a_distance_is_that_of_its_ends(file, result):
 
 def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result):
     stage, plate = load(file), result.artifact
-    a, b = stage.length_uncertainty()
+    a, b = stage.length_uncertainty(anywhere=False)
     i, j = np.triu_indices(25, 1)
     x, y = plate.x_m.ravel(), plate.y_m.ravel()
     length = np.hypot(x[j] - x[i], y[j] - y[i])
@@ -108,6 +126,18 @@ def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result)
     margin = a + b * length - U
     assert margin.min() > -1e-7 * U.max() and margin.min() < 1e-3 * U.max()
     assert a > 0 <= b and a + b * length.max() < 2 * U.max()
+
+
+def test_between_nodes_the_line_covers_the_interpolation_too(file, result):
+    stage, plate, rng = load(file), result.artifact, np.random.default_rng(4)
+    ends = rng.uniform(-2, 2, (4, 400)) * plate.grid_pitch_m
+    ends[:, :50] = (np.floor(ends[:, :50] / plate.grid_pitch_m) + 0.5) * plate.grid_pitch_m
+    ends = ends[:, np.hypot(*(ends[:2] - ends[2:])) > 0]
+    a, b = stage.length_uncertainty()
+    U = result.noise.k_xy * stage.length_error(ends[:2], ends[2:])[1]
+    margin = a + b * np.hypot(*(ends[:2] - ends[2:])) - U
+    assert -0.01 * U.max() < margin.min() < 0.2 * U.max()
+    assert a > 1.5 * stage.length_uncertainty(anywhere=False)[0]
 
 
 def test_many_distances_are_evaluated_in_parts(file, monkeypatch):

@@ -63,11 +63,35 @@ def run(args: argparse.Namespace) -> int:
         say(args, f"written: {args.output}, {len(points)} points",
             {"written": args.output, "points": len(points), "unknown": unknown,
              "outside": outside})
+    _say_better(stage, points)
     for count, what in ((outside, "outside the field, corrected as the nearest point of its edge"),
                         (unknown, "next to unknown sites or lines, left empty")):
         if count:
             print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
     return exit_code(stage.result)
+
+
+def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
+    """Say that bicubic interpolation is worth more, if it halves most of u between the nodes."""
+    import sys
+
+    import numpy as np
+
+    from selfcal_ros.compensation.compensator import Compensator
+    from selfcal_ros.model.error_map import rms
+    from selfcal_ros.units import UM_PER_M
+
+    emap, used = stage.error_map, rms(stage.halfway)
+    x, y = points[:, :2].T
+    plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
+    if stage.method == "bicubic" or not emap.valid.all() \
+            or not rms(plain) > 2 * rms(np.stack([emap.u_gx, emap.u_gy])):
+        return
+    cubic = rms(Compensator(emap, method="bicubic").halfway)
+    if cubic < used / 2:
+        print("selfcal apply: between the nodes most of u is that of bilinear interpolation, "
+              f"{used * UM_PER_M:.2g} um halfway: --method bicubic has {cubic * UM_PER_M:.2g} um",
+              file=sys.stderr)
 
 
 def read_points(text: str, where: str) -> "np.ndarray":
@@ -136,10 +160,11 @@ def distances(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tupl
     x1, y1, x2, y2 = points.T
     error, u = stage.length_error((x1, y1), (x2, y2))
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u]).tolist()
-    a, b = stage.length_uncertainty()
-    print(f"selfcal apply: in the whole field U of a distance L is at most {a * UM_PER_M:.3g} um + "
-          f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
-          file=sys.stderr)
+    for where, anywhere in (("anywhere in the field", True), ("of two nodes", False)):
+        a, b = stage.length_uncertainty(anywhere=anywhere)
+        print(f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} um + "
+              f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
+              file=sys.stderr)
     outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
     lines = [",".join(map(repr, row)) for row in rows]
     return ("\n".join([",".join([*ENDS, "length", "error", "u"]), *lines]) + "\n", 0,

@@ -9,11 +9,13 @@ The error map contains G = indicated - true at the true position of the marks, h
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from selfcal_ros.compensation.between import error_halfway, share_between
 from selfcal_ros.compensation.cells import (
     MAX_ITERATIONS,
     REST,
@@ -48,6 +50,9 @@ class Compensator:
         angular map with harmonics is its Fourier series with both.
     outside : {"clamp", "refuse"}
         Outside the calibrated field: use the error of the nearest point of its edge, or raise.
+    fitted : {"bilinear", "bicubic"}, optional
+        Interpolation with which the map was estimated, if it has nodes of its own: what it does not
+        follow is then in the uncertainty of its nodes.
 
     Raises
     ------
@@ -64,7 +69,7 @@ class Compensator:
 
     def __init__(self, error_map: ErrorMap, *,
                  method: Interpolation = "bilinear",
-                 outside: Outside = "clamp") -> None:
+                 outside: Outside = "clamp", fitted: Interpolation | None = None) -> None:
         if method not in get_args(Interpolation):
             raise InputError("compensator method", f"'{method}' is unknown",
                              "take bilinear or bicubic")
@@ -72,6 +77,7 @@ class Compensator:
             raise InputError("compensator outside", f"'{outside}' is unknown",
                              "take clamp or refuse")
         self.error_map, self.method, self.outside = error_map, method, outside
+        self._is_fitted = fitted == method
         self._pitch = error_map.artifact.grid_pitch_m
         fields = np.stack([error_map.gx, error_map.gy])
         if method == "bicubic" and not np.isfinite(fields).all():
@@ -162,7 +168,8 @@ class Compensator:
         The uncertainties of the sites, interpolated bilinearly: an upper bound for the bilinear
         value whatever the correlation of the sites. The bicubic value for sites with equal and
         independent errors stays within it to 1 %, except in the outermost cells, where it may
-        exceed it by 37 %. The stage error between its sites is not included.
+        exceed it by 37 %. In quadrature to it the error of interpolation between the sites, from
+        the map's own curvature (method eq. 1.7), unless the map was estimated with it.
 
         Raises
         ------
@@ -170,8 +177,29 @@ class Compensator:
             With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
-        return self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
-                            self._u_cells.block)
+        ux, uy = self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
+                              self._u_cells.block)
+        more_x, more_y = self._between(x_m, y_m)
+        return np.hypot(ux, more_x), np.hypot(uy, more_y)
+
+    @cached_property
+    def halfway(self) -> np.ndarray:
+        """The error of interpolation halfway between sites, rms, m: [of Gx, Gy; along x, y]."""
+        emap, cubic = self.error_map, self.method == "bicubic"
+        if self._is_fitted:
+            return np.zeros((2, 2))
+        return np.array([[error_halfway(np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0),
+                                        cubic=cubic)[0] for axis in (0, 1)]
+                         for g, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))])
+
+    def _between(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
+        """Return the standard uncertainty of the interpolation of Gx and Gy, (2, ...), m."""
+        shares = []
+        for p, half in zip(np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half,
+                           strict=True):
+            at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
+            shares.append(share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)))
+        return np.tensordot(self.halfway, np.stack(shares), axes=1)
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return Gtheta = indicated - true, rad, at true angles; any number of turns.
@@ -238,7 +266,18 @@ class Compensator:
             If the map has no angular lines.
         """
         self._refuse_no_theta()
-        return self._u_theta.at(np.asarray(theta_rad, dtype=float))
+        angle, count = np.asarray(theta_rad, dtype=float), self.error_map.artifact.angular_count
+        return np.hypot(self._u_theta.at(angle), self._halfway_theta * share_between(
+            angle * (count / (2 * np.pi))))
+
+    @cached_property
+    def _halfway_theta(self) -> float:
+        emap, cubic = self.error_map, self.method == "bicubic"
+        if emap.artifact.harmonics:
+            return 0.0
+        ring, u = (np.concatenate([part[-3:], part, part[:3]]) if cubic else np.concatenate(
+            [part[-1:], part, part[:1]]) for part in (emap.g_theta, emap.u_g_theta))
+        return error_halfway(ring, u, cubic=cubic)[0]
 
     def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         hx, hy = self.error_map.artifact.half

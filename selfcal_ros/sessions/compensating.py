@@ -110,10 +110,11 @@ class CompensatingSession:
 
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
-        method = self._settings.interpolation
+        method, fitted = self._settings.interpolation, None
         if stated in get_args(Interpolation):
-            method = cast(Interpolation, stated) if error_map.valid.all() else "bilinear"
-        self.compensator = Compensator(error_map, method=method,
+            fitted = cast(Interpolation, stated)
+            method = fitted if error_map.valid.all() else "bilinear"
+        self.compensator = Compensator(error_map, method=method, fitted=fitted,
                                        outside=self._settings.outside)
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")

@@ -348,9 +348,14 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
 
 def distance_text(stage: StageMap, a: float, b: float) -> str:
     """Return the statement U = a + b L on distances in the field, a in m and b in m/m."""
+    nodes = ""
+    if stage.halfway.any():
+        a_nodes, b_nodes = stage.length_uncertainty(anywhere=False)
+        nodes = (f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "
+                 f"· L, without the {stage.method} interpolation between nodes")
     return (f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
-            f"+ {b * UM_PER_M:.3g} µm/m · L, k = {stage.result.noise.k_xy:.3g}, 95.45 %: errors of "
-            "neighbouring nodes are correlated.")
+            f"+ {b * UM_PER_M:.3g} µm/m · L{nodes}; k = {stage.result.noise.k_xy:.3g}, 95.45 %. "
+            "Errors of neighbouring nodes are correlated.")
 
 
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:

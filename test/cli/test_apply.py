@@ -89,9 +89,12 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     assert head == ["x1", "y1", "x2", "y2", "length", "error", "u"]
     error, u = StageMap(result).length_error(*rows[:, :4].T.reshape(2, 2, 2))
     np.testing.assert_array_equal(rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], error, u])
-    a, b = StageMap(result).length_uncertainty()
-    line, outside = capsys.readouterr().err.splitlines()
-    assert f"U of a distance L is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L" in line
+    *lines, outside = capsys.readouterr().err.splitlines()
+    for line, anywhere in zip(lines, (True, False), strict=True):
+        a, b = StageMap(result).length_uncertainty(anywhere=anywhere)
+        where = "anywhere in the field" if anywhere else "of two nodes"
+        assert (f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
+                in line)
     assert outside.endswith("nearest point of its edge: 1")
     assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--inverse"]) == 2
     assert "the ends of distances are true positions" in capsys.readouterr().err
@@ -120,3 +123,17 @@ def test_outside_refused_and_not_qualified(desk, capsys):
     write_json("R.json", result_to_dict(doubt))
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 5
     assert "too noisy" in capsys.readouterr().err and (desk / "o.csv").exists()
+
+
+def test_bicubic_is_advised_where_it_halves_u_between_the_nodes(desk, capsys):
+    """A stage of long waves, one whose nodes are independent, and points on nodes alone."""
+    emap = random_map(Artifact(9, 0.01), 1)
+    wave = 1e-6 * np.sin(emap.artifact.x_m / 0.015 + emap.artifact.y_m / 0.02)
+    noise = np.random.default_rng(2).normal(0, 1e-6, wave.shape)
+    for g, at, advised in ((wave, 0.005, True), (noise, 0.005, False), (wave, 0.01, False)):
+        (desk / "d.csv").write_text(f"x,y\n{at},{at}\n0.02,{-at}\n")
+        u = np.full(wave.shape, 1e-9)
+        write_json("R.json", result_to_dict(result_of(replace(
+            emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u))))
+        assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 0
+        assert ("--method bicubic has" in capsys.readouterr().err) is advised

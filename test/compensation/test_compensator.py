@@ -173,8 +173,12 @@ def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
     if method == "bilinear":
         assert compensator.error_theta(-np.pi / 24) == pytest.approx(
             (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16)
-        assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(
-            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, abs=1e-16)
+        ring = np.append(MAP.g_theta, MAP.g_theta[:2])  # each line less the mean of its neighbours
+        bent = ring[1:-1] - (ring[:-2] + ring[2:]) / 2
+        power = 1.5 * np.mean(MAP.u_g_theta**2)
+        assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(np.hypot(
+            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, np.sqrt(np.mean(bent**2) - power) / 4))
+        assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(MAP.u_g_theta[23])
 
 
 def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
@@ -182,6 +186,7 @@ def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
     ux, uy = compensator.uncertainty(ARTIFACT.x_m, ARTIFACT.y_m)
     np.testing.assert_allclose(ux, MAP.u_gx, rtol=1e-12)
     np.testing.assert_allclose(uy, MAP.u_gy, rtol=1e-12)
+    compensator.halfway = np.zeros((2, 2))
     assert compensator.uncertainty(0.005, 0.0)[0] == pytest.approx(MAP.u_gx[5:7, 5].mean())
 
 

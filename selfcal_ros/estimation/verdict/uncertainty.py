@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.compensation.between import error_halfway, mean_square
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
@@ -163,9 +164,6 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
     return replace(result, noise=replace(noise, dof_map_xy=more, k_xy=coverage_factor(more),
                                          dof_map_theta=noise.dof_theta))
 
-
-CELL_MEAN = 8 / 15
-"""Mean square of the parabola 4 s (1 - s) over a cell: rms of an interpolation error."""
 
 INTERPOLATION = "interpolation"
 """The component that only a map used between its nodes or lines has."""
@@ -329,41 +327,28 @@ def _reference_line(u: np.ndarray, reference: dict[str, Any] | None) -> BudgetLi
 
 
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
-    """Estimate the error of linear interpolation from the map's own curvature.
+    """Estimate the error of linear interpolation; none with the nodes' own interpolation.
 
-    A site minus the mean of its neighbours is the error of interpolation over two pitches, four
-    times that over one pitch if the error is smooth. The part that noise explains is subtracted.
+    What a map with nodes of its own does not follow is its lack of fit, part of its uncertainty.
     """
     emap = result.error_map
-    squares = [_curvature(field, u, axis) for field, u in ((emap.gx, emap.u_gx),
-                                                           (emap.gy, emap.u_gy))
-               for axis in (0, 1)]
-    # both directions contribute to the error of each coordinate
-    return _interpolation("xy", sum(value for value, _ in squares) / 2,
-                          max(largest for _, largest in squares))
+    if result.plate.map_grid is not None:
+        return _interpolation("xy", 0.0, 0.0)
+    found = [[error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))
+              for axis in (0, 1)] for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))]
+    return _interpolation("xy", np.mean([mean_square(x[0], y[0]) for x, y in found]),
+                          max(x[1] + y[1] for x, y in found))
 
 
 def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
-    g, u = result.error_map.g_theta, result.error_map.u_g_theta
     if result.plate.harmonics:  # a Fourier series is known between the lines as on them
         return _interpolation("theta", 0.0, 0.0)
-    ring, ring_u = (np.concatenate([a[-1:], a, a[:1]]) for a in (g, u))
-    return _interpolation("theta", *_curvature(ring, ring_u, 0))
+    rms_, largest = error_halfway(*(np.concatenate([a[-1:], a, a[:1]]) for a in (
+        result.error_map.g_theta, result.error_map.u_g_theta)))
+    return _interpolation("theta", mean_square(rms_, 0.0), largest)
 
 
 def _interpolation(quantity: str, square: float, largest: float) -> BudgetLine:
-    middle, worst = np.sqrt(max(square, 0.0)) / 4, float(np.sqrt(largest) / 4)
-    u = float(np.sqrt(CELL_MEAN) * middle)
+    u = float(np.sqrt(square))
     return BudgetLine(quantity, INTERPOLATION, "B", 0.0, u, "m" if quantity == "xy" else "rad",
-                      u, worst, np.inf, "readings")
-
-
-def _curvature(field: np.ndarray, u: np.ndarray, axis: int) -> tuple[float, float]:
-    """Return mean and largest square of a site minus the mean of its neighbours, less noise."""
-    values, power = np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0) ** 2
-    square = (values[1:-1] - (values[:-2] + values[2:]) / 2) ** 2
-    square = square - (power[1:-1] + (power[:-2] + power[2:]) / 4)
-    known = square[np.isfinite(square)]
-    if not len(known):
-        return 0.0, 0.0
-    return float(known.mean()), float(max(known.max(), 0.0))
+                      u, largest, np.inf, "readings")
