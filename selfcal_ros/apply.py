@@ -162,8 +162,8 @@ class StageMap(Compensator):
         square += 2 * ex * ey * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n]
                                  - cover[j, i + n])
         if anywhere:
-            worst = self.halfway.sum(axis=1)
-            square += 2 * ((ex * worst[0])**2 + (ey * worst[1])**2)
+            worst = (self.halfway**2).sum(axis=1)
+            square += 2 * (ex**2 * worst[0] + ey**2 * worst[1])
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
         found = linprog([1.0, (length / length.max()).mean()], b_ub=-U / size, A_ub=-np.stack(

@@ -79,14 +79,16 @@ def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
 
 
 def test_interpolation_adds_its_error_between_the_nodes(file, result):
-    """Nothing at a node, on an edge that along it, in the middle of a cell the sum of both."""
+    """Nothing at a node, on an edge that along it, in the middle of a cell both."""
     stage, pitch = load(file), result.artifact.grid_pitch_m
     stage.halfway = np.zeros((2, 2))
     x, y = np.array([0.0, 0.5, 0.5, 0.75, 0.5, 9.0]) * pitch, np.array(
         [1.0, 1.0, 0.5, 1.5, -0.5, 0.5]) * pitch
     plain, before = stage.covariance(x, y), stage.uncertainty(x, y)
     stage.halfway = np.array([[3e-8, 3e-8], [0.0, 5e-8]])
-    added = np.array([[0, 3, 6, 5.25, 6, 3], [0, 0, 5, 5, 5, 5]]) * 1e-8
+    both = np.sqrt(2)
+    added = np.array([[0, 3, 3 * both, 3 * np.hypot(0.75, 1), 3 * both, 3],
+                      [0, 0, 5, 5, 5, 5]]) * 1e-8
     np.testing.assert_allclose(stage.uncertainty(x, y), np.hypot(before, added))
     cells = [[a == b for a in "ABCBDE"] for b in "ABCBDE"]  # (0.5, 1) is in the cell of y = 1..2
     wanted = plain + np.kron([[1, 0], [0, 0]], np.outer(added[0], added[0]) * cells) + np.kron(

@@ -199,7 +199,7 @@ class Compensator:
                            strict=True):
             at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
             shares.append(share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)))
-        return np.tensordot(self.halfway, np.stack(shares), axes=1)
+        return np.sqrt(np.tensordot(self.halfway**2, np.stack(shares)**2, axes=1))
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return Gtheta = indicated - true, rad, at true angles; any number of turns.
@@ -275,8 +275,8 @@ class Compensator:
         emap, cubic = self.error_map, self.method == "bicubic"
         if emap.artifact.harmonics:
             return 0.0
-        ring, u = (np.concatenate([part[-3:], part, part[:3]]) if cubic else np.concatenate(
-            [part[-1:], part, part[:1]]) for part in (emap.g_theta, emap.u_g_theta))
+        ring, u = (np.concatenate([part[-3:], part, part[:3]])
+                   for part in (emap.g_theta, emap.u_g_theta))
         return error_halfway(ring, u, cubic=cubic)[0]
 
     def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

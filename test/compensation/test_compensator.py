@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
+from selfcal_ros.compensation.between import error_halfway
 from selfcal_ros.compensation.cells import bicubic_cells, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
@@ -173,11 +174,10 @@ def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
     if method == "bilinear":
         assert compensator.error_theta(-np.pi / 24) == pytest.approx(
             (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16)
-        ring = np.append(MAP.g_theta, MAP.g_theta[:2])  # each line less the mean of its neighbours
-        bent = ring[1:-1] - (ring[:-2] + ring[2:]) / 2
-        power = 1.5 * np.mean(MAP.u_g_theta**2)
+        ring = [np.append(part[-3:], np.append(part, part[:3]))
+                for part in (MAP.g_theta, MAP.u_g_theta)]
         assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(np.hypot(
-            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, np.sqrt(np.mean(bent**2) - power) / 4))
+            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, error_halfway(*ring)[0]))
         assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(MAP.u_g_theta[23])
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.compensation.between import error_halfway, mean_square
+from selfcal_ros.compensation.between import CELL_MEAN, error_halfway
 from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
@@ -336,19 +336,19 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
         return _interpolation("xy", 0.0, 0.0)
     found = [[error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))
               for axis in (0, 1)] for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))]
-    return _interpolation("xy", np.mean([mean_square(x[0], y[0]) for x, y in found]),
-                          max(x[1] + y[1] for x, y in found))
+    return _interpolation("xy", np.sqrt(np.mean([x[0]**2 + y[0]**2 for x, y in found])),
+                          max(np.hypot(x[1], y[1]) for x, y in found))
 
 
 def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
     if result.plate.harmonics:  # a Fourier series is known between the lines as on them
         return _interpolation("theta", 0.0, 0.0)
-    rms_, largest = error_halfway(*(np.concatenate([a[-1:], a, a[:1]]) for a in (
-        result.error_map.g_theta, result.error_map.u_g_theta)))
-    return _interpolation("theta", mean_square(rms_, 0.0), largest)
+    ring, u = (np.concatenate([a[-2:], a, a[:2]]) for a in (
+        result.error_map.g_theta, result.error_map.u_g_theta))
+    return _interpolation("theta", *error_halfway(ring, u))
 
 
-def _interpolation(quantity: str, square: float, largest: float) -> BudgetLine:
-    u = float(np.sqrt(square))
+def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:
+    u = float(np.sqrt(CELL_MEAN) * halfway)
     return BudgetLine(quantity, INTERPOLATION, "B", 0.0, u, "m" if quantity == "xy" else "rad",
                       u, largest, np.inf, "readings")
