@@ -94,13 +94,12 @@ def run(args: argparse.Namespace) -> int:
 def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str) -> "Counter[str]":
     """Write a bag from image files and a table of positions; return problems."""
     from selfcal_ros.bagio.images import read_positions, write_pictures
+    from selfcal_ros.collection.settings.estimator import read_plan
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_yaml
-    from selfcal_ros.model.view import plan_from_dict
 
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
-    plan = plan_from_dict(read_yaml(args.plan), args.plan)
+    plan = read_plan(args.plan)
     return write_pictures(Path(args.bag), read_positions(args.positions, plan), plan, args.output,
                           detect=detector.take_file, frame_id=frame)
 

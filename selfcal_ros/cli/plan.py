@@ -176,8 +176,10 @@ def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *
 
 def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -> list[str]:
     artifact = plan.artifact
-    lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {artifact.shape[0]} x "
-             f"{artifact.shape[1]} marks, {artifact.angular_count} angular lines",
+    marks = (f"{artifact.shape[0]} x {artifact.shape[1]}" if artifact.marks is None else
+             f"a list of {artifact.shape[0]}")
+    lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
+             f"{artifact.angular_count} angular lines",
              *_nodes_text(plan), *_image_text(plan),
              f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
     if predicted is None or not seen.identifiable:

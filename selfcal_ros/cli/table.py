@@ -83,11 +83,13 @@ def npz_bytes(result: "CalibrationResult") -> bytes:
     import numpy as np
 
     emap, plate = result.error_map, result.artifact
-    out = io.BytesIO()
+    out, found = io.BytesIO(), result.plate.marks
+    marks = {} if found is None else {
+        "mark_id": found.id_array, "mark_x": found.places_m[0], "mark_y": found.places_m[1]}
     np.savez(out, gx=emap.gx, gy=emap.gy, u_gx=emap.u_gx, u_gy=emap.u_gy, g_theta=emap.g_theta,
              u_g_theta=emap.u_g_theta, ax=result.artifact_map.ax, ay=result.artifact_map.ay,
              result=np.str_(" sha256:".join(result.read_from or ())),
              a_theta=result.artifact_map.a_theta, grid_pitch=np.float64(plate.grid_pitch_m),
              nonorthogonality=np.float64(emap.nonorthogonality),
-             scale_difference=np.float64(emap.scale_difference))
+             scale_difference=np.float64(emap.scale_difference), **marks)
     return out.getvalue()

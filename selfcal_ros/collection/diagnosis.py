@@ -326,11 +326,15 @@ class DetectionsSeen:
         where = np.stack([stage.x.position, stage.y.position])
         where *= -1 if self.sense is Sense.PLATE_MOVES else 1
         good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
+        if self.artifact.marks:
+            good &= self.artifact.has(table["m"], table["n"])
+        places = np.zeros((2, len(table)))
+        places[:, good] = self.artifact.places(table["m"][good], table["n"][good])
         where += places_of_cells(view, np.stack([table["ox"], table["oy"]]))
         pose = view.on_stage(self.artifact)
         away = []
         for other in (pose, *other_poses(pose)):
-            site = np.stack(other.site_of(table["m"], table["n"])) * self.artifact.grid_pitch_m
+            site = np.stack(other.site_of(*places)) * self.artifact.grid_pitch_m
             away.append(np.quantile(np.hypot(*(where - site))[good], 0.9) if good.any() else np.inf)
         best = int(np.argmin(away))
         if not best or away[best] > limit:
@@ -342,17 +346,18 @@ class DetectionsSeen:
                          ) -> tuple[np.ndarray, np.ndarray]:
         """Return indicated positions and sites, both (2, n), of grid marks with ids."""
         table, view_of = self.table[rows], self.view_of[rows]
-        (hx, hy), pitch = self.artifact.half, self.artifact.grid_pitch_m
+        pitch = self.artifact.grid_pitch_m
         stage = self.exposures.at(table["stamp"])
         where = np.stack([stage.x.position, stage.y.position])
         good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
-        good &= (np.abs(table["m"]) <= hx) & (np.abs(table["n"]) <= hy)
+        good &= self.artifact.has(table["m"], table["n"])
         parts = [np.zeros((4, 0))]
         for index, readings in views.items():
             here = good & (view_of == index)
             if here.any() and readings.view.grid:
                 pose = readings.view.on_stage(self.artifact)
-                site = np.stack(pose.site_of(table["m"][here], table["n"][here])) * pitch
+                marks = self.artifact.places(table["m"][here], table["n"][here])
+                site = np.stack(pose.site_of(*marks)) * pitch
                 offset = np.stack([table["ox"][here], table["oy"][here]])
                 site = site - places_of_cells(readings.view, offset)
                 parts.append(np.concatenate([where[:, here], site]))

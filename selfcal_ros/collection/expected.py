@@ -62,7 +62,7 @@ def _read(artifact: Artifact, part: ViewReadings, min_repeats: int) -> np.ndarra
     """Return the marks that were read often enough in a cell, bool (nx, ny)."""
     done = read_enough(part.view, part, min_repeats)[0]
     out = np.zeros(artifact.shape, dtype=bool)
-    out[part.m[done] + artifact.half[0], part.n[done] + artifact.half[1]] = True
+    out[artifact.index(part.m[done], part.n[done])] = True
     return out
 
 
@@ -114,10 +114,10 @@ def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
     if readings.cells:
         m, n = _missing_stops(artifact, view, readings, min_repeats)
         return Missing(tuple(m.tolist()), tuple(n.tolist()), tuple(lines.tolist()))
-    row = readings.m[done] + artifact.half[0]
+    row = artifact.index(readings.m[done], readings.n[done])[0]
     number = first_missing(np.sort(of_zero[row] + readings.n[done]), grid)
     row = np.searchsorted(end, number, "right")
-    return Missing(tuple((row - artifact.half[0]).tolist()),
+    return Missing(tuple(artifact.marks_at(row, row)[0].tolist()),
                    tuple((number - of_zero[row]).tolist()), tuple(lines.tolist()))
 
 

@@ -171,10 +171,13 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     if not 0 <= view_index <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
     readings.view.on_stage(artifact)
-    for name, index, least, most in (
-            ("m", readings.m, -artifact.half[0], artifact.half[0]),
-            ("n", readings.n, -artifact.half[1], artifact.half[1]),
-            ("k", readings.k, 0, artifact.angular_count - 1)):
+    limits = [("k", readings.k, 0, artifact.angular_count - 1)]
+    if artifact.marks is None:
+        limits[:0] = [(name, index, -half, half) for name, index, half in zip(
+            "mn", (readings.m, readings.n), artifact.half, strict=True)]
+    elif not artifact.has(readings.m, readings.n).all():
+        raise InputError(where, "an id that is not in the list of marks", "correct the publisher")
+    for name, index, least, most in limits:
         if len(index) and not least <= np.min(index) <= np.max(index) <= most:
             raise InputError(where, f"{name} goes beyond {least} to {most}",
                              "correct the publisher")

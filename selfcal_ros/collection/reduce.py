@@ -289,12 +289,11 @@ def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.n
 def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules,
                  rejected: Counter, places: PlaceList) -> dict:
     """Return the grid readings of a view, or of a sub-view: offsets from the place of its cell."""
-    d, (hx, hy) = marks.detections, artifact.half
-    key = (marks.index[0] + hx) * (2 * hy + 1) + marks.index[1] + hy
+    d, key = marks.detections, artifact.flat(*marks.index)
     offset = np.stack([d["ox"] - view.cell_m.real, d["oy"] - view.cell_m.imag])
     means = reduce_repeats(
         key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
-        extent=2 * max(hx, hy) * artifact.grid_pitch_m, residual=marks.residual,
+        extent=2 * max(artifact.reach) * artifact.grid_pitch_m, residual=marks.residual,
         steady=without_aside(key, marks.deviation, offset, view.check_offset_m))
     _count(rejected, Reason.OUTLIER, means.outlier)
     out = np.flatnonzero(means.outlier)
@@ -304,8 +303,8 @@ def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules
                          step_m=view.check_offset_m / 2 or np.inf)
     motion = None if view.cell not in (None, (0, 0)) else repeat_motion(  # the same in every cell
         key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
-    mark = means.key.astype(np.int64)
-    return {"m": mark // (2 * hy + 1) - hx, "n": mark % (2 * hy + 1) - hy, "dx": means.mean[0],
+    m, n = artifact.marks_at(*np.divmod(means.key.astype(np.int64), artifact.shape[1]))
+    return {"m": m, "n": n, "dx": means.mean[0],
             "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
             "dof_xy": means.dof, "visits": visits, "motion": motion,
             "outliers": _outliers_of(means, key)}

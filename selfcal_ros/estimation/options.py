@@ -5,6 +5,8 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import numpy as np
+
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -95,10 +97,13 @@ class ReferenceLength:
         except ValueError as error:
             raise InputError(where, f"'{text}' is not M,N:M,N:LENGTH:U", example) from error
         for mark in marks:
-            if any(abs(at) > half for at, half in zip(mark, artifact.half, strict=True)):
-                raise InputError(where, f"the plate has no mark {mark}", "its marks go from "
-                                 f"(-{artifact.half[0]}, -{artifact.half[1]}) to {artifact.half}")
-        nominal = artifact.grid_pitch_m * math.dist(*marks)
+            if not artifact.has(*map(np.array, mark)):
+                known = "write ID,0 of marks in its list" if artifact.marks else (
+                    f"its marks go from (-{artifact.half[0]}, -{artifact.half[1]}) to "
+                    f"{artifact.half}")
+                raise InputError(where, f"the plate has no mark {mark}", known)
+        nominal = artifact.grid_pitch_m * math.dist(*(
+            tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks))
         if nominal == 0:
             raise InputError(where, f"'{text}' names one mark twice", "name two marks")
         return cls(ReferenceKind.MARKS, (length - nominal) / nominal, u / nominal, certificate,

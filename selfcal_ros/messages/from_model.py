@@ -55,9 +55,24 @@ def detection(d: Detection, frame_id: str) -> Fields:
 
 
 def _artifact(artifact: Artifact) -> Fields:
+    if artifact.marks:
+        return {**_NO_PLATE, "angular_count": artifact.angular_count,
+                "map_harmonics": artifact.harmonics}
     return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
             "angular_count": artifact.angular_count, "grid_size_y": artifact.grid_size_y,
             "map_harmonics": artifact.harmonics}
+
+
+_NO_PLATE = {"grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0,
+             "map_harmonics": 0}
+
+
+def _marks(artifact: Artifact | None) -> Fields:
+    """Return the fields of a list of marks; empty for a lattice."""
+    marks = artifact.marks if artifact else None
+    return {"mark_id": marks.id_array if marks else [],
+            "mark_x": marks.places_m[0] if marks else [],
+            "mark_y": marks.places_m[1] if marks else []}
 
 
 def _map_grid(artifact: Artifact | None) -> Fields:
@@ -85,16 +100,14 @@ def _view(view: View) -> Fields:
 def command(c: Command, frame_id: str) -> Fields:
     """Return the fields of a selfcal_msgs/ViewCommand."""
     view = _view(c.view or View("", grid=False, angular=False, repeats=0))
-    plate = _artifact(c.artifact) if c.artifact else {
-        "grid_size": 0, "grid_pitch": 0.0, "angular_count": 0, "grid_size_y": 0,
-        "map_harmonics": 0}
+    plate = _artifact(c.artifact) if c.artifact else _NO_PLATE
     return {"header": header(c.stamp_ns, frame_id), "phase": int(c.phase), "plan_id": c.plan_id,
             "view_index": c.view_index, **view, **plate, "views_planned": c.views_planned,
             "visit_order": c.view.visit_order if c.view else "", "run_id": c.run_id,
             "model_terms": list(c.model_terms),
             "check_marks": c.view.check_marks if c.view else 0,
             "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact),
-            **_image(c.view), "artifact_from": c.artifact_from}
+            **_image(c.view), "artifact_from": c.artifact_from, **_marks(c.artifact)}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -140,7 +153,7 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         "model_terms": list(measurements.model_terms), "session_notes": list(notes),
         **_map_grid(measurements.artifact), **_image(readings.view),
         "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1],
-        "artifact_from": measurements.artifact_from}
+        "artifact_from": measurements.artifact_from, **_marks(measurements.artifact)}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

@@ -19,6 +19,7 @@ from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
@@ -110,9 +111,11 @@ def notes_of(message: Any) -> tuple[str, ...]:
 
 def artifact_of(message: Any) -> Artifact:
     """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
+    ids = [int(number) for number in getattr(message, "mark_id", ())]
+    marks = marks_of(ids, _floats(message.mark_x), _floats(message.mark_y)) if ids else None
     return Artifact(int(message.grid_size), float(message.grid_pitch),
                     int(message.angular_count), int(getattr(message, "grid_size_y", 0)),
-                    _map_grid_of(message), int(getattr(message, "map_harmonics", 0)))
+                    _map_grid_of(message), int(getattr(message, "map_harmonics", 0)), marks)
 
 
 def _map_grid_of(message: Any) -> MapGrid | None:

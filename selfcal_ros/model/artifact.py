@@ -4,13 +4,14 @@
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from math import ceil
+from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import checked_fields
+from selfcal_ros.model.marks import MarkList, marks_of
 
 MAX_GRID_SIZE = 1001
 MAX_ANGULAR_COUNT = 1_000_000
@@ -54,7 +55,8 @@ class MapGrid:
 class Artifact:
     """Nominal geometry of the plate, and the grid of the stage's map.
 
-    Unless `map_grid` is given, the map has its nodes on the plate's lattice.
+    Unless `map_grid` is given, the map has its nodes on the plate's lattice. The marks of a list
+    are arrays (n, 1): n rows of one mark, m the ids, n = 0.
 
     Attributes
     ----------
@@ -72,6 +74,9 @@ class Artifact:
     harmonics : int
         H, harmonics of the angular map, below K/2: a Fourier series, for views at any turn. 0 = one
         value for each line, for views turned by whole lines.
+    marks : MarkList, optional
+        The marks if they are no lattice; `grid_size` is then their number and `grid_pitch_m` the
+        median distance of neighbours, whatever is given.
 
     Raises
     ------
@@ -86,10 +91,16 @@ class Artifact:
     grid_size_y: int = 0
     map_grid: MapGrid | None = None
     harmonics: int = 0
+    marks: MarkList | None = None
 
     def __post_init__(self) -> None:
         """Refuse sizes without a centre mark and counts without a quarter turn."""
-        for name, size in (("grid_size", self.grid_size), ("grid_size_y", self.shape[1])):
+        if self.marks is not None:
+            for name, value in (("grid_size", len(self.marks.ids)), ("grid_size_y", 1),
+                                ("grid_pitch_m", self.marks.spacing_m)):
+                object.__setattr__(self, name, value)
+        sides = ("grid_size", self.grid_size), ("grid_size_y", self.shape[1])
+        for name, size in () if self.marks else sides:
             if not 3 <= size <= MAX_GRID_SIZE or size % 2 == 0:
                 raise InputError(f"artifact {name}", f"{size} is not an odd number from 3 to "
                                  f"{MAX_GRID_SIZE}", "the plate needs a mark at its centre")
@@ -119,8 +130,16 @@ class Artifact:
     def field(self) -> "Artifact":
         """Lattice of the error map: that of the plate unless `map_grid` is given."""
         grid = self.map_grid
+        if grid is None and self.marks is not None:
+            raise InputError("artifact marks", "a list of marks without nodes of the map",
+                             "give map_grid_size and map_grid_pitch with it")
         return self if grid is None else Artifact(
             grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics)
+
+    @property
+    def lattice(self) -> "Artifact":
+        """The lattice of the marks; of a list that of the error map."""
+        return self if self.marks is None else self.field
 
     @property
     def field_half_m(self) -> tuple[float, float]:
@@ -135,27 +154,82 @@ class Artifact:
 
     @property
     def half(self) -> tuple[int, int]:
-        """Largest index along x and y: h = (N-1)/2."""
+        """Largest index along x and y of a lattice: h = (N-1)/2.
+
+        Raises
+        ------
+        ValueError
+            For a list of marks, which has no rows.
+        """
+        if self.marks is not None:
+            raise ValueError("a list of marks has no rows")
         return self.shape[0] // 2, self.shape[1] // 2  # both are odd
+
+    @cached_property
+    def reach(self) -> tuple[float, float]:
+        """Largest x and y of a mark, in pitches."""
+        if self.marks is None:
+            return self.half
+        x, y = np.abs(self.marks.places_m).max(axis=1) / self.grid_pitch_m
+        return float(x), float(y)
 
     @cached_property
     def m(self) -> np.ndarray:
         """Index m of every site, int array (nx, ny)."""
+        if self.marks is not None:
+            return self.marks.id_array[:, None]
         return np.repeat(np.arange(self.shape[0])[:, None] - self.half[0], self.shape[1], axis=1)
 
     @cached_property
     def n(self) -> np.ndarray:
         """Index n of every site, int array (nx, ny)."""
+        if self.marks is not None:
+            return np.zeros(self.shape, dtype=int)
         return np.repeat(np.arange(self.shape[1])[None, :] - self.half[1], self.shape[0], axis=0)
+
+    def has(self, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """Return which of the marks (m, n) are on the plate, bool."""
+        if self.marks is not None:
+            return np.isin(m, self.marks.id_array) & (np.asarray(n) == 0)
+        hx, hy = self.half
+        return (np.maximum(m, -m) <= hx) & (np.maximum(n, -n) <= hy)
+
+    def index(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indices of marks of the plate in arrays (nx, ny)."""
+        if self.marks is not None:
+            return np.searchsorted(self.marks.id_array, m), np.zeros_like(n)
+        return m + self.half[0], n + self.half[1]
+
+    def marks_at(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return m and n of the marks with these indices in arrays (nx, ny)."""
+        if self.marks is not None:
+            return self.marks.id_array[i], np.zeros_like(j)
+        return i - self.half[0], j - self.half[1]
+
+    def flat(self, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """Return the indices of marks of the plate in flattened arrays."""
+        i, j = self.index(m, n)
+        return i * self.shape[1] + j
+
+    def places(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nominal places of marks on the plate, in pitches: on a lattice (m, n)."""
+        if self.marks is None:
+            return m, n
+        x, y = self.marks.places_m[:, self.index(m, n)[0]] / self.grid_pitch_m
+        return x, y
 
     @property
     def x_m(self) -> np.ndarray:
         """Nominal x of every site in m, (nx, ny)."""
+        if self.marks is not None:
+            return self.marks.places_m[0][:, None]
         return self.m * self.grid_pitch_m
 
     @property
     def y_m(self) -> np.ndarray:
         """Nominal y of every site in m, (nx, ny)."""
+        if self.marks is not None:
+            return self.marks.places_m[1][:, None]
         return self.n * self.grid_pitch_m
 
     @property
@@ -193,13 +267,27 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
 
     They span the field of the plate; along its longer side there are three quarters as many nodes
     as marks, at least five if there are as many marks, at most `DEFAULT_NODES`. With as many nodes
-    as marks the readings hardly determine the outermost ones.
+    as marks the readings hardly determine the outermost ones. Of a list, as many marks count along
+    a side as a lattice of the same number would have over the rectangle that it covers.
+
+    Raises
+    ------
+    InputError
+        If a list is too short to choose the nodes.
     """
-    longer = max(artifact.half)
-    cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, 2 * longer))
+    longer = max(artifact.reach)
+    if artifact.marks is not None:
+        along = sqrt(len(artifact.marks.ids) * longer / min(artifact.reach))
+        cells = int(0.75 * along - 1 + 1e-9) // 2 * 2
+        if cells < 2:
+            raise InputError("artifact marks", f"{len(artifact.marks.ids)} marks are too few to "
+                             "choose the nodes of the map", "give them in the plan, e.g. "
+                             "map: {grid_size: 3}, or use a plate with more marks")
+    else:
+        cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer)))
     cells = min(cells, DEFAULT_NODES - 1)
     pitch_m = 2 * longer * artifact.grid_pitch_m / cells
-    sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.half]
+    sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.reach]
     return MapGrid(sides[0], pitch_m, Interpolation.BICUBIC,
                    sides[1] if sides[1] != sides[0] else 0)
 
@@ -221,6 +309,49 @@ def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
         raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
                          f"use one of {', '.join(Interpolation)}")
     sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
-    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.half, sizes, strict=True))
+    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.reach, sizes, strict=True))
     return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
                    Interpolation(raw["interpolation"]), raw["grid_size_y"])
+
+
+def artifact_of(data: dict, where: str) -> Artifact:
+    """Return the plate of a mapping without the nodes of its map.
+
+    Parameters
+    ----------
+    data : dict
+        ``grid_size``, ``grid_pitch`` (m), ``angular_count`` and optionally ``grid_size_y``; or
+        ``marks {id, x, y}``, lists (m), and optionally ``angular_count``.
+    where : str
+        File name and key, for messages.
+
+    Raises
+    ------
+    InputError
+        For a missing or unknown key, a wrong type, or an impossible plate.
+    """
+    if "marks" in data:
+        raw = checked_fields(data, where, {"marks": dict}, {"angular_count": (int, 0)})
+        lists = checked_fields(raw["marks"], f"{where}: marks", dict.fromkeys("xy", list)
+                               | {"id": list})
+        if len({len(column) for column in lists.values()}) > 1 or not all(
+                type(value) in ((int,) if key == "id" else (int, float))
+                for key, column in lists.items() for value in column):
+            raise InputError(f"{where}: marks", "id, x and y are not as many numbers each",
+                             "give each mark a whole id, x and y in m")
+        return Artifact(0, 0.0, raw["angular_count"], marks=marks_of(
+            lists["id"], lists["x"], lists["y"]))
+    raw = checked_fields(data, where, {"grid_size": int, "grid_pitch": float,
+                                       "angular_count": int}, {"grid_size_y": (int, 0)})
+    return Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"])
+
+
+def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
+    """Return a plate as `artifact_of` takes it."""
+    count = {"angular_count": artifact.angular_count}
+    if artifact.marks is not None:
+        marks = artifact.marks
+        return {"marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)},
+                **count}
+    return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m, **count,
+            **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})}

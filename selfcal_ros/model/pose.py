@@ -71,7 +71,7 @@ class StagePose(ABC):
         return self.turn_lines
 
     def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the site (x, y) of mark (m, n): R (m, n) + shift.
+        """Return the site (x, y) of a place (m, n) on the plate, pitches: R (m, n) + shift.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class StagePose(ABC):
     def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
         """Return the marks inside the field of the stage and their sites, arrays (2, V)."""
         marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
-        sites = np.stack(self.site_of(*marks))
+        sites = np.stack(self.site_of(*artifact.places(*marks)))
         inside = ~self.beyond_field(sites, artifact)
         return marks[:, inside], sites[:, inside]
 
@@ -215,8 +215,9 @@ class PlacedPose(StagePose):
 
 @lru_cache(64)
 def _placed_rows(pose: PlacedPose, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
-    inside = ~pose.beyond_field(np.stack(pose.site_of(artifact.m, artifact.n)), artifact)
-    return inside.argmax(axis=1) - artifact.half[1], inside.sum(axis=1)
+    sites = np.stack(pose.site_of(*artifact.places(artifact.m, artifact.n)))
+    inside = ~pose.beyond_field(sites, artifact)
+    return inside.argmax(axis=1) + artifact.n[0, 0], inside.sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -254,7 +255,8 @@ class Pose:
 
     def places(self, artifact: Artifact, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return the nominal places of marks on the stage, x + iy, complex, m."""
-        return self.phase * (m + 1j * n) * artifact.grid_pitch_m + complex(*self.shift_m)
+        x, y = artifact.places(m, n)
+        return self.phase * (x + 1j * y) * artifact.grid_pitch_m + complex(*self.shift_m)
 
     def in_field(self, artifact: Artifact) -> np.ndarray:
         """Return the marks of the plate that lie in the stage's field, bool (nx, ny)."""
@@ -313,6 +315,9 @@ class Image:
 
     def steps(self, artifact: Artifact) -> int:
         """Return the distance between cells in pitches of the plate; InputError if not whole."""
+        if artifact.marks is not None:
+            raise InputError("image", "images show the cells of a lattice, the plate is a list of "
+                             "marks", "leave image out: one mark in an exposure")
         return whole_steps(self.pitch_m / artifact.grid_pitch_m, "image pitch_m", "pitch",
                            "let cells be whole pitches of the plate apart")
 

@@ -328,7 +328,8 @@ def placing_digest(artifact: Artifact, view: View) -> str:
                *view.translation_m, view.grid, view.angular, view.repeats,
                view.check_marks, view.check_offset_m)
     text = ",".join(float(number).hex() for number in numbers)
-    text += "".join(repr(part) for part in (artifact.map_grid, view.image) if part is not None)
+    text += "".join(repr(part) for part in (artifact.map_grid, view.image, artifact.marks)
+                    if part is not None)
     text += f",{artifact.harmonics}" if artifact.harmonics else ""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -11,7 +11,13 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model import json_form
-from selfcal_ros.model.artifact import Artifact, map_grid_from_dict, map_to_dict
+from selfcal_ros.model.artifact import (
+    Artifact,
+    artifact_of,
+    artifact_to_dict,
+    map_grid_from_dict,
+    map_to_dict,
+)
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.json_form import plain, read
 from selfcal_ros.model.readings import Measurements
@@ -248,9 +254,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "plan_id": result.plan_id,
         "method": result.method,
         "measurement_sense": result.sense,
-        "artifact": {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
-                     "angular_count": artifact.angular_count,
-                     **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {}),
+        "artifact": {**artifact_to_dict(artifact),
                      **{key: plain(getattr(amap, key))
                         for key in ("magnification", "u_magnification")}},
         **({"map": own} if (own := map_to_dict(artifact)) else {}),
@@ -315,9 +319,12 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
-    artifact = Artifact(raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
-                        raw.get("grid_size_y", 0), map_grid_from_dict(own := data.get("map", {})),
-                        read(int, own.get("harmonics", 0)))
+    grid, own = data.get("map", {}), read(int, data.get("map", {}).get("harmonics", 0))
+    artifact = Artifact(
+        raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
+        raw.get("grid_size_y", 0)) if "marks" not in raw else artifact_of(
+            {key: raw[key] for key in ("marks", "angular_count")}, "artifact")
+    artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=own)
     emap, amap = data["error_map"], data["artifact_map"]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))

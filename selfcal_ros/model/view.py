@@ -11,6 +11,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import (
     Artifact,
+    artifact_of,
+    artifact_to_dict,
     default_map_grid,
     harmonics_of,
     map_grid_of,
@@ -149,7 +151,7 @@ class View:
             As `lattice_pose`; if the map has nodes of its own, only if the pose is not finite, is
             beyond every field, or has lines to be measured and is no whole number of them.
         """
-        if artifact.map_grid is None:
+        if artifact.map_grid is None and artifact.marks is None:
             return self.lattice_pose(artifact)
         shift = self._pitches(artifact)
         lines = self._lines(artifact) if self.angular and artifact.angular_count else None
@@ -182,6 +184,8 @@ class View:
 
     def is_on_lattice(self, artifact: Artifact) -> bool:
         """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
+        if artifact.marks is not None:
+            return False
         steps = (*self._pitches(artifact), self.rotation_rad / (math.pi / 2))
         return not self.grid or all(nearest_step(step) is not None for step in steps)
 
@@ -254,15 +258,14 @@ def plan_from_dict(data: object, where: str) -> Plan:
     Parameters
     ----------
     data : object
-        Parsed YAML: ``plan_id``, ``artifact {grid_size, grid_pitch, angular_count}`` (m),
+        Parsed YAML: ``plan_id``, ``artifact`` as `artifact_of` takes it,
         ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
         with ``translation_mm`` instead of ``translation_pitch``, ``visit_order``, for views without
         their own, ``map {grid_size, grid_pitch, interpolation, grid_size_y, harmonics}``, nodes
-        that are not the plate's sites (default off the lattice: `default_map_grid`) and harmonics
-        of the angular map, ``model_terms``, a list of ``TERM`` or ``TERM:SIZE``, ``check_stops
-        {marks, offset}`` (m) of views with grid marks, ``microscope {scale_u, rotation_u,
-        shear_u}``, its standard uncertainties, ``image {nx, ny, pitch_m}``, marks that an exposure
-        shows, and the result ``artifact_from``, which made the plate known.
+        off the plate's sites (default off the lattice: `default_map_grid`), harmonics of the
+        angular map, ``model_terms``, each ``TERM`` or ``TERM:SIZE``, ``check_stops {marks,
+        offset}`` (m) of views with grid marks, ``microscope {scale_u, rotation_u, shear_u}`` (u),
+        ``image {nx, ny, pitch_m}``, and ``artifact_from``, which made the plate known.
     where : str
         File name, for messages.
 
@@ -276,12 +279,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
                             {"visit_order": (str, ""), "model_terms": (list, []),
                              "check_stops": (dict, {}), "microscope": (dict, {}),
                              "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, "")})
-    raw = checked_fields(fields["artifact"], f"{where}: artifact",
-                         {"grid_size": int, "grid_pitch": float, "angular_count": int},
-                         {"grid_size_y": (int, 0)})
-    artifact = Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"],
-                        raw["grid_size_y"],
-                        harmonics=harmonics_of(fields["map"], f"{where}: map"))
+    artifact = replace(artifact_of(fields["artifact"], f"{where}: artifact"),
+                       harmonics=harmonics_of(fields["map"], f"{where}: map"))
     order = _order(fields["visit_order"], where)
     if len(fields["views"]) > MAX_VIEWS:
         raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
@@ -365,6 +364,9 @@ def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, fl
     given = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
     if len(given) > 1:
         raise InputError(where, f"{' and '.join(given)} are given", "leave one of them out")
+    if given == ["translation_pitch"] and artifact.marks is not None:
+        raise InputError(f"{where}: translation_pitch", "a list of marks has no pitch",
+                         "give translation_mm: [a, b]")
     shift = raw[given[0]] if given else [0, 0]
     if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
         raise InputError(f"{where}: {given[0]}", "not two numbers", "give [a, b]")
@@ -375,24 +377,22 @@ def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, fl
 
 def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
     """Return a view in the format of PLAN.yaml."""
-    shift = view.on_stage(artifact).shift
+    unit = "pitch" if artifact.marks is None else "mm"
+    shift = view.on_stage(artifact).shift if unit == "pitch" else [
+        value * MM_PER_M for value in view.translation_m]
     order = {"visit_order": view.visit_order} if view.visit_order else {}
     return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
-            "translation_pitch": [round(step, 9) for step in shift], "grid": view.grid,
+            f"translation_{unit}": [round(step, 9) for step in shift], "grid": view.grid,
             "angular": view.angular, "repeats": view.repeats, **order}
 
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
     """Return a plan in the format of PLAN.yaml."""
-    artifact = plan.artifact
-    plate = {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m,
-             "angular_count": artifact.angular_count}
-    if artifact.grid_size_y:
-        plate["grid_size_y"] = artifact.grid_size_y
-    own = map_to_dict(artifact)
+    artifact, own = plan.artifact, map_to_dict(plan.artifact)
     marks, offset_m = plan.check_stops
     image = next((view.image for view in plan.views if view.image), None)
-    return {"plan_id": plan.plan_id, "artifact": plate, **({"map": own} if own else {}),
+    return {"plan_id": plan.plan_id, "artifact": artifact_to_dict(artifact),
+            **({"map": own} if own else {}),
             "views": [view_to_dict(view, artifact) for view in plan.views],
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"image": dict(vars(image))} if image else {}),

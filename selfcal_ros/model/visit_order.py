@@ -86,7 +86,8 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     marks, sites = view.on_stage(artifact).marks_in_field(artifact)
     n_passes = 1 if consecutive else view.repeats
     of_plate = chosen.of_plate or artifact.map_grid is not None  # no lines of sites off the lattice
-    passes = _passes(chosen, marks if of_plate else sites, n_passes, rng)
+    places = np.stack(artifact.places(*marks)) if of_plate else sites
+    passes = _passes(chosen, places, n_passes, rng)
     return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
 
 
@@ -97,11 +98,11 @@ def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
         if rng is None:
             raise ValueError("a random visiting order needs a source of chance")
         return np.stack([rng.permutation(places.shape[1]) for _ in range(n_passes)])
-    x, y = places
+    (x, y), (row, column) = places, np.rint(places)  # marks of a list: lines one pitch wide
     # line by line along x: each line runs along y
-    along_x, along_y = np.lexsort((y, x)), np.lexsort((x, y))
+    along_x, along_y = np.lexsort((y, row)), np.lexsort((x, column))
     cycle = {"raster": (along_x,),
-             "serpentine": (np.lexsort((np.where((x - x.min()) % 2, -y, y), x)),),
+             "serpentine": (np.lexsort((np.where((row - row.min()) % 2, -y, y), row)),),
              "there_and_back": (along_x, along_x[::-1]),
              "x_then_y": (along_x, along_y),
              "x_back_y_back": (along_x, along_x[::-1], along_y, along_y[::-1])}[order.name]

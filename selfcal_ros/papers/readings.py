@@ -25,7 +25,8 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
     pose, sign = view.on_stage(artifact), -1 if sense is Sense.PLATE_MOVES else 1
-    inside = ~pose.beyond_field(np.stack(pose.site_of(*physics.all_marks(artifact))), artifact)
+    sites = np.stack(pose.site_of(*artifact.places(*physics.all_marks(artifact))))
+    inside = ~pose.beyond_field(sites, artifact)
     out, stop = np.full_like(site, np.nan), sign * site[:, inside]
     if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
         i, j = np.rint(stop / artifact.grid_pitch_m).astype(int) + np.array(artifact.half)[:, None]

@@ -2,7 +2,7 @@
 """The session of `selfcal cell check`: a short run that shows the faults of a cell."""
 
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,9 @@ class CheckItem:
 
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
     """Return the middle of a plan's plate, and its view: straight, with check stops."""
-    plate = Artifact(MARKS, plan.artifact.grid_pitch_m, plan.artifact.angular_count)
+    plate, listed = plan.artifact, plan.artifact.marks
+    plate = (replace(plate, marks=listed.innermost(MARKS**2)) if listed else
+             Artifact(MARKS, plate.grid_pitch_m, plate.angular_count))
     marks = next((view for view in plan.views if view.check_marks), View(""))
     offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
     angular = plate.angular_count > 0 and any(view.angular for view in plan.views)

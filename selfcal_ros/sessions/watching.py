@@ -171,6 +171,8 @@ def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, i
                   n_missing: int, most: int) -> tuple[list[str], int]:
     """Return the plate in its own frame, top line first, and the number of marks per cell side.
 
+    Of a list of marks each cell is a square, at least as wide as marks are apart.
+
     ``o`` read, ``.`` missing, ``?`` unknown, blank: not in this view. The worst of several marks
     is shown. Empty if nothing is known.
 
@@ -191,14 +193,29 @@ def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, i
     named = sorted(missing)
     if not count.any() or (n_missing > 0 and not named):
         return [], 1
-    (hx, hy), step = artifact.half, max(1, ceil(max(artifact.shape) / most))
-    m, n = np.arange(-hx, hx + 1)[:, None], np.arange(-hy, hy + 1)
+    i, j = map(np.arange, artifact.shape)
+    m, n = artifact.marks_at(i, i)[0][:, None], artifact.marks_at(j, j)[1]
     signs = ((n >= first[:, None]) & (n < (first + count)[:, None])).astype(np.int8)
     if n_missing > len(named):  # marks after the last named one are unknown
         signs[(signs > 0) & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))] = 2
-    for i, j in named:
-        if abs(i) <= hx and abs(j) <= hy and signs[i + hx, j + hy]:
-            signs[i + hx, j + hy] = 3
+    for mark in named:
+        there = artifact.has(*map(np.array, mark))
+        at = artifact.index(*map(np.array, mark))
+        if there and signs[at]:
+            signs[at] = 3
+    signs, step = _squares(signs, artifact, most)
     for axis in (0, 1):
         signs = np.maximum.reduceat(signs, np.arange(0, signs.shape[axis], step), axis=axis)
     return ["".join(row) for row in np.array(list(" o?."))[signs].T[::-1]], step
+
+
+def _squares(signs: np.ndarray, artifact: Artifact, most: int) -> tuple[np.ndarray, int]:
+    """Return the signs of marks by their places, the largest in each square, and marks a side."""
+    if artifact.marks is None:
+        return signs, max(1, ceil(max(artifact.shape) / most))
+    size = np.minimum(np.ceil(2 * np.array(artifact.reach)).astype(int) + 1, most)
+    low, high = (ends(artifact.marks.places_m, axis=1)[:, None] for ends in (np.min, np.max))
+    part = (artifact.marks.places_m - low) / (high - low)
+    out = np.zeros(size, dtype=np.int8)
+    np.maximum.at(out, tuple(np.rint(part * (size[:, None] - 1)).astype(int)), signs[:, 0])
+    return out, 1

@@ -209,8 +209,8 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     size = len(visit)
     m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
     place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
-    site = (np.stack(view.on_stage(truth.artifact).site_of(visits.m, visits.n))
-            * truth.artifact.grid_pitch_m)
+    places = truth.artifact.places(visits.m, visits.n)
+    site = np.stack(view.on_stage(truth.artifact).site_of(*places)) * truth.artifact.grid_pitch_m
     tau = np.arange(size) / max(size - 1, 1)
     moved = physics.drift(truth, index, tau)
     sign = -1 if settings.sense is Sense.PLATE_MOVES else 1

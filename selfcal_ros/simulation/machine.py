@@ -34,8 +34,8 @@ class Spread:
         Standard deviations of each view's misalignment.
     correlation_pitches : float
         Correlation length L of the stage error, and of that of the rotary encoder in lines:
-        exp(-d^2 / 2 L^2) at the distance d. 0: independent errors at sites and lines, bilinear
-        in between.
+        exp(-d^2 / 2 L^2) at the distance d; pitches of the map for a list of marks. 0:
+        independent errors at sites and lines, bilinear in between.
     encoder : str
         ``independent``: the rotary encoder is independent of the axes, only its mean is 0.
         ``xy_axes``: it agrees with the slopes of the half axes (Hu eq. 9).
@@ -300,13 +300,13 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         plate, temperature, strain, drifts. Default `rng`.
     """
     spread = spread or Spread()
-    drawn_g, waves = _stage(artifact, spread, rng)
-    g = remove_modes(drawn_g, datum_modes(artifact, scale=True))
+    drawn_g, waves = _stage(artifact.lattice, spread, rng)
+    g = remove_modes(drawn_g, datum_modes(artifact.lattice, scale=True))
     a = remove_modes(rng.normal(0, spread.a_m, (2, *artifact.shape)),
                      datum_modes(artifact, scale=False))
     a += spread.pitch_error * np.stack([artifact.x_m, artifact.y_m])
     drawn_theta, waves_theta = _circle(artifact.angular_count, spread, rng)
-    g_theta = _encoder(artifact, g, drawn_theta, spread.encoder)
+    g_theta = _encoder(artifact.lattice, g, drawn_theta, spread.encoder)
     a_theta = rng.normal(0, spread.a_theta_rad, artifact.angular_count)
     yaw = np.zeros((0, 0))
     if spread.stage_yaw_rad:

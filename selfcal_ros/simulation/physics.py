@@ -32,15 +32,16 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
     m, n : int array (V,)
         The marks.
     """
-    (hx, hy), pitch = truth.artifact.half, truth.artifact.grid_pitch_m
-    moved = truth.a[:, m + hx, n + hy]
+    (hx, hy), pitch = truth.artifact.reach, truth.artifact.grid_pitch_m
+    x, y = truth.artifact.places(m, n)
+    moved = truth.a[:, *truth.artifact.index(m, n)]
     if len(truth.plate_scale):
-        moved = moved + truth.plate_scale[index] * np.stack([m, n]) * pitch
+        moved = moved + truth.plate_scale[index] * np.stack([x, y]) * pitch
     if len(truth.plate_shape_m):
-        u, v = m / hx, n / hy
+        u, v = x / hx, y / hy
         moved = moved + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
     if len(truth.plate_strain):
-        moved = moved + truth.plate_strain[index] @ np.stack([m, n]) * pitch
+        moved = moved + truth.plate_strain[index] @ np.stack([x, y]) * pitch
     return moved
 
 
@@ -55,12 +56,17 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
     m, n : int arrays (V,)
         The marks found there.
     there : bool array (V,)
-        Whether the plate has a mark there; `m` and `n` are 0 if not.
+        Whether the plate has a mark there; `m` and `n` are any if not.
     """
     artifact = truth.artifact
     lies = truth.placed_as(index, view).on_stage(artifact)
-    x, y = view.on_stage(artifact).site_of(*marks)
-    m, n = np.rint(lies.turned_back(x - lies.shift[0], y - lies.shift[1])).astype(int)
+    x, y = view.on_stage(artifact).site_of(*artifact.places(*marks))
+    place = lies.turned_back(x - lies.shift[0], y - lies.shift[1])
+    if artifact.marks:
+        away, near = artifact.marks.tree.query(np.stack(place, axis=1) * artifact.grid_pitch_m)
+        return (artifact.marks.id_array[near], np.zeros(len(near), dtype=int),
+                away < artifact.grid_pitch_m / 2)
+    m, n = np.rint(place).astype(int)
     hx, hy = artifact.half
     there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
     return m * there, n * there, there
@@ -96,8 +102,9 @@ def mark_places(truth: Truth, index: int, view: View,
     """
     m, n = marks
     pose, pitch = view.on_stage(truth.artifact), truth.artifact.grid_pitch_m
-    site = np.stack(pose.site_of(m, n)) * pitch
-    arm = np.stack(pose.turned(*np.stack([m, n]) * pitch))
+    x, y = truth.artifact.places(m, n)
+    site = np.stack(pose.site_of(x, y)) * pitch
+    arm = np.stack(pose.turned(*np.stack([x, y]) * pitch))
     error = np.stack(pose.turned(*plate_displacement(truth, index, m, n)))
     phi = truth.phi_rad[index]
     if truth.linear:
@@ -115,8 +122,8 @@ def mark_places(truth: Truth, index: int, view: View,
 
 def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
     """Return the height of marks on the plate, (V,), m; the plate is part of a sphere."""
-    hx, hy = truth.artifact.half
-    return truth.plate_bow_m * (1 - (m / hx) ** 2 - (n / hy) ** 2)
+    (hx, hy), (x, y) = truth.artifact.reach, truth.artifact.places(m, n)
+    return truth.plate_bow_m * (1 - (x / hx) ** 2 - (y / hy) ** 2)
 
 
 def _tilted(tilt: np.ndarray, arm: np.ndarray, height: np.ndarray,
@@ -174,7 +181,7 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
 
     Bilinear between the sites, plus waves and the bending of the stage in that view.
     """
-    artifact = truth.artifact
+    artifact = truth.artifact.lattice
     place, g = position / artifact.grid_pitch_m, truth.g
     if len(truth.waves.number):
         sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
@@ -197,7 +204,8 @@ def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray 
     """Return the bending of the stage at indicated positions (2, E) in a view, m."""
     if not len(truth.stage_bend_m):
         return 0.0
-    u, v = position / (truth.artifact.grid_pitch_m * np.array(truth.artifact.half)[:, None])
+    lattice = truth.artifact.lattice
+    u, v = position / (lattice.grid_pitch_m * np.array(lattice.half)[:, None])
     return truth.stage_bend_m[index] @ np.stack([u * u, u * v, v * v])
 
 

@@ -274,6 +274,9 @@ def read_simulation(path: str | Path) -> Simulation:
     if camera is not None:
         _check_of_images(data.get("faults", {}), f"{where}: faults")
     plan = _plan(data["plan"], Path(path))
+    if camera is not None and plan.artifact.marks:
+        raise InputError(f"{where}: camera", "images are rendered of lattices, the plate is a list "
+                         "of marks", "leave camera out: simulate detections")
     return Simulation(plan, top["seed"], Spread(**read["truth"], **read["physics"]), settings,
                       faults, round(top["start_time"] * NS_PER_S), top["compression"],
                       top["noise_seed"] if "noise_seed" in data else None,

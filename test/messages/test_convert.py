@@ -112,6 +112,7 @@ def test_fields_of_a_detection_by_name():
 
 PLATE = Artifact(5, 0.0125, 8, 7, MapGrid(9, 0.02, Interpolation.BILINEAR, 11), 3)
 NO_IMAGE = {"image_nx": 0, "image_ny": 0, "image_pitch": 0.0}
+NO_MARKS = {"mark_id": [], "mark_x": [], "mark_y": []}
 MAP_FIELDS = {"map_grid_size": 9, "map_grid_size_y": 11, "map_grid_pitch": 0.02,
               "map_interpolation": "bilinear", "map_harmonics": 3}
 
@@ -128,7 +129,7 @@ def test_fields_of_a_command_by_name():
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
         "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS,
-        **NO_IMAGE, "artifact_from": "/r.json"}
+        **NO_IMAGE, "artifact_from": "/r.json", **NO_MARKS}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -285,7 +286,8 @@ def test_fields_of_a_view_measurement_by_name():
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
         "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
-        **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0, "artifact_from": "/r.json"}
+        **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0, "artifact_from": "/r.json",
+        **NO_MARKS}
 
 
 def test_fields_of_a_view_status_by_name():

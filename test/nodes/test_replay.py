@@ -29,6 +29,7 @@ from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
+from test.support.mark_lists import listed_plan
 from test.support.plans import image_plan, placed_plan
 from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
 
@@ -40,8 +41,8 @@ def undated(text: str) -> str:
 
 
 @pytest.fixture(scope="module", params=[None, placed_plan(count=8, repeats=2),
-                                        image_plan(5, count=8, repeats=2)],
-                ids=["on the lattice", "placed", "images"])
+                                        image_plan(5, count=8, repeats=2), listed_plan()],
+                ids=["on the lattice", "placed", "images", "a list of marks"])
 def solved(request, tmp_path_factory):
     """Return a bag and the text of the result that `selfcal solve` writes for it."""
     folder = tmp_path_factory.mktemp("replay")

@@ -11,6 +11,7 @@ from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.collecting import START_NS, collect
+from test.support.mark_lists import listed_plan, rings, scatter
 from test.support.plans import placed_plan, plan_of
 from test.support.truth import simulate_measurements
 
@@ -35,7 +36,8 @@ CASES = {
 
 
 PLANS = {"on the lattice": plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3),
-         "placed": placed_plan(7, size_y=5, count=8, repeats=3)}
+         "placed": placed_plan(7, size_y=5, count=8, repeats=3),
+         "a list of marks": listed_plan(scatter(40, half_m=0.02, angular_count=8), repeats=3)}
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -92,9 +94,11 @@ def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
 
 
 @pytest.mark.parametrize("sense", list(Sense))
-def test_placed_plates_are_read_without_ids(sense):
+@pytest.mark.parametrize("plan", [placed_plan(11, count=24), listed_plan(repeats=1),
+                                  listed_plan(rings(angular_count=24))],
+                         ids=["lattice", "scattered", "circles"])
+def test_placed_plates_are_read_without_ids(plan, sense):
     """Turned by 17 mrad more than commanded, and 0.3 pitches beside."""
-    plan = placed_plan(11, count=24)
     spread = Spread(phi_rad=0.017, t_m=2e-3, correlation_pitches=4.0)
     truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
     settings = CellSettings(sense, 2e-8, 1e-6, with_ids=False)

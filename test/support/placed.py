@@ -74,7 +74,7 @@ def readings(artifact: Artifact, poses, rng, *, sigma=20e-9, size=1e-6, turn=3e-
                     tuple(pitch * artifact.grid_pitch_m for pitch in pitches), True, False)
         inside = view.pose.in_field(artifact)
         m, n = artifact.m[inside], artifact.n[inside]
-        at, mark = view.pose.places(artifact, m, n), (m + 1j * n) * artifact.grid_pitch_m
+        at, mark = view.pose.places(artifact, m, n), (artifact.x_m + 1j * artifact.y_m)[inside]
         phase, phi, t = np.exp(1j * view.rotation_rad), turn * rng.normal(), shift * (
             complex_normal(()))
         of_stage = rows(artifact, at) @ field.ravel() if stage is None else stage(at)
@@ -85,23 +85,25 @@ def readings(artifact: Artifact, poses, rng, *, sigma=20e-9, size=1e-6, turn=3e-
     return Measurements("placed", artifact, tuple(views)), Truth(field, plate_error)
 
 
-def dense(measurements: Measurements) -> tuple[np.ndarray, np.ndarray]:
+def dense(measurements: Measurements,
+          known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return G in its datum and its standard uncertainty for unit noise, (2, nx, ny) each.
+
+    The datum is that of the `known` nodes, of all unless they are given; others are NaN.
 
     By one matrix of all readings and unknowns, linear in the rotations, and its pseudo-inverse.
     """
     artifact = measurements.artifact
-    n, marks = artifact.field.m.size, artifact.m.size
+    n, each = artifact.field.m.size, np.stack([artifact.m, artifact.n])
+    z = (artifact.x_m + 1j * artifact.y_m).ravel()
     blocks, values = [], []
     for number, view in enumerate(measurements.views):
-        m, hx = view.m, artifact.half
-        at = view.view.pose.places(artifact, m, view.n)
-        phase = np.exp(1j * view.view.rotation_rad)
-        w = rows(artifact, at)
-        own = np.zeros((len(m), marks))
-        own[np.arange(len(m)), (m + hx[0]) * artifact.shape[1] + view.n + hx[1]] = 1
-        here = np.zeros((len(m), 3 * len(measurements.views)), dtype=complex)
-        here[:, 3 * number] = phase * 1j * (m + 1j * view.n) / artifact.half[0]
+        phase, (a, b) = np.exp(1j * view.view.rotation_rad), view.view.translation_m
+        own = np.array([(mark == each.reshape(2, -1).T).all(axis=1) for mark in zip(
+            view.m, view.n, strict=True)], dtype=float)  # each mark by its name
+        w = rows(artifact, phase * (own @ z) + complex(a, b))
+        here = np.zeros((len(own), 3 * len(measurements.views)), dtype=complex)
+        here[:, 3 * number] = phase * 1j * (own @ z) / z.real.max()
         here[:, 3 * number + 1:3 * number + 3] = 1, 1j
         row = np.hstack([w, 1j * w, phase * own, 1j * phase * own, here])
         blocks += [row.real, row.imag]
@@ -109,8 +111,10 @@ def dense(measurements: Measurements) -> tuple[np.ndarray, np.ndarray]:
     design, y = np.vstack(blocks), np.concatenate(values)
     inverse = np.linalg.pinv(design, rcond=1e-10)
     modes = datum_modes(artifact.field, scale=True).reshape(4, -1).T
-    basis = np.linalg.qr(modes)[0]
-    projected = inverse[:2 * n] - basis @ (basis.T @ inverse[:2 * n])
+    there = np.tile(np.ones(n, dtype=bool) if known is None else known.ravel(), 2)
+    projected = inverse[:2 * n] - modes @ np.linalg.lstsq(
+        modes[there], inverse[:2 * n][there], rcond=None)[0]
+    projected[~there] = np.nan
     return ((projected @ y).reshape(2, *artifact.field.shape),
             np.sqrt((projected**2).sum(axis=1)).reshape(2, *artifact.field.shape))
 

@@ -118,9 +118,9 @@ def _read(sense: Sense, found: cell.GridExposures | cell.AngularExposures) -> np
 
 def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
           settings: cell.CellSettings, lost: np.ndarray, start_ns: int) -> ViewReadings:
-    visits, (hx, hy) = found.visits, truth.artifact.half
-    kept = ~lost[visits.m + hx, visits.n + hy] & found.there
-    key = (visits.m + hx) * (2 * hy + 1) + visits.n + hy
+    visits, artifact = found.visits, truth.artifact
+    kept = ~lost[artifact.index(visits.m, visits.n)] & found.there
+    key = artifact.flat(visits.m, visits.n)
     marks, mark = np.unique(key[kept], return_inverse=True)
     number = np.cumsum(kept) - 1  # index of a visit among those kept
     here = kept[found.visit]
@@ -139,11 +139,12 @@ def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
     # the stage moves to the first mark one period after the view begins
     first = start_ns + settings.period_ns + settings.exposure_ns
     stamp = first + np.rint(visits.time[kept] * settings.period_ns).astype(np.int64)
-    order = np.lexsort((stamp, mark))
+    order, (m, n) = np.lexsort((stamp, mark)), artifact.marks_at(*np.divmod(marks,
+                                                                            artifact.shape[1]))
     dx, dy, ox, oy = (row[order] for row in (*by_visit, *offset))
     approach = found.approach[:, kept][:, order]
     return replace(
-        readings, m=marks // (2 * hy + 1) - hx, n=marks % (2 * hy + 1) - hy, dx=by_mark[0],
+        readings, m=m, n=n, dx=by_mark[0],
         dy=by_mark[1], count=readings_of, sigma_xy=sigma, dof_xy=dof,
         motion=motion,
         visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, approach[0],

@@ -19,6 +19,12 @@ SURE = 0.25
 one: with an unknown offset of a quarter pitch it stays below half a pitch."""
 OFF_ANY_PLATE_M = 1e9
 """Coordinates beyond this are clipped."""
+LOOKED_AT = 50
+"""Detections from which the offset of a view without ids is found on a list of marks."""
+CANDIDATES = 4
+"""Marks that each of them may be."""
+ON_MARK = 0.1
+"""Distance, in pitches, within which a detection lies on a mark of a list."""
 HALF_A_LINE = 0.45
 """Largest possible rotation, in lines, for which the nearest line is the detected one."""
 
@@ -37,7 +43,7 @@ class IdentityRules:
 
         Default: half a pitch plus the motion of the plate's rim by the largest rotation.
         """
-        rim = self.max_rotation_rad * float(np.hypot(*artifact.half))
+        rim = self.max_rotation_rad * float(np.hypot(*artifact.reach))
         return self.max_stage_distance_m or (0.5 + rim) * artifact.grid_pitch_m
 
 
@@ -87,29 +93,29 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
                           rigids.Rigid())
-    half = np.array(artifact.half)[:, None]
-    named_unknown = has_id & (np.abs(ids) > half).any(axis=0)
-    marks = np.where(has_id & ~named_unknown, ids, 0)
+    named_unknown = has_id & ~artifact.has(*ids)
+    marks = np.where(has_id & ~named_unknown, ids,
+                     np.array([[artifact.marks.ids[0]], [0]]) if artifact.marks else 0)
     reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
     astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
     named, free = has_id & ~named_unknown & ~astray, ~has_id
-    known, fit = _settle(pose, centred, half, marks, (named, free), pitch, rules)
+    known, fit = _settle(pose, centred, artifact, marks, (named, free), rules)
     rigid = known.rigid if fit.marks < 3 else fit.rigid
     far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
     if free.any():
         nominal = known.rigid.undo(centred[:, free])
-        marks[:, free], ratio, distance = _nearest(pose, nominal, pitch, half)
+        marks[:, free], ratio, distance, apart = _nearest(pose, nominal, artifact)
         error, reach = known.error_at(nominal), TOO_FAR_FROM_ANY * pitch
         unsure[free] = (error > SURE * pitch) & (distance <= reach + error)
-        ambiguous[free] = (distance <= reach) & (ratio > rules.ambiguity_ratio)
+        ambiguous[free] = (distance <= reach) & ~unsure[free] & (error > SURE * apart)
+        ambiguous[free] |= (distance <= reach) & (ratio > rules.ambiguity_ratio)
         far[free] = (distance > reach) & ~unsure[free]
-    site = np.stack(pose.site_of(marks[0], marks[1]))
+    site = np.stack(pose.site_of(*artifact.places(*marks)))
     deviation = reading_m - site * pitch
-    about = _about(pose, marks, pitch)
-    number = marks[0] * (2 * artifact.half[1] + 1) + marks[1]
-    few = _at_most_two(number[~far & ~ambiguous & ~unsure])  # the view's own motion is not known
+    about = _about(pose, marks, artifact)
+    few = _at_most_two(artifact.flat(*marks)[~far & ~ambiguous & ~unsure])
     limit = pitch / 4 if few else min(rules.max_deviation_m, pitch / 4)
     residual = deviation - rigid.at(about)
     far |= ~ambiguous & (distances(residual) > limit)
@@ -136,26 +142,36 @@ def _astray(pose: StagePose, marks: np.ndarray, stage_m: np.ndarray | None, arti
     astray = np.empty(marks.shape[1], dtype=bool)
     for start in range(0, len(astray), PART):
         here = slice(start, start + PART)
-        site = np.stack(pose.site_of(marks[0, here], marks[1, here])) * artifact.grid_pitch_m
+        site = np.stack(pose.site_of(*artifact.places(*marks[:, here]))) * artifact.grid_pitch_m
         away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
         astray[here] = distances(away) > limit_m
     return astray & among
 
 
-def _nearest(pose: StagePose, centred: np.ndarray, pitch: float, half: np.ndarray,
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nearest mark (2, n), distance ratio to the second nearest, and distance in m."""
-    step = centred / pitch
+def _nearest(pose: StagePose, centred: np.ndarray, artifact: Artifact,
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return nearest mark (2, n), distance ratio to the second nearest, distance in m.
+
+    Also, of a list of marks, the distance of the two nearest ones from each other, m.
+    """
+    pitch, every = artifact.grid_pitch_m, np.full(centred.shape[1], np.inf)
+    if artifact.marks:
+        plate = np.stack(pose.turned_back(centred[0], centred[1]))
+        away, two = artifact.marks.tree.query(np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2)
+        apart = distances(np.diff(artifact.marks.places_m[:, two], axis=2)[:, :, 0])
+        mark = np.stack([artifact.marks.id_array[two[:, 0]], np.zeros(len(two), dtype=int)])
+        return mark, away[:, 0] / np.maximum(away[:, 1], 1e-12 * pitch), away[:, 0], apart
+    half, step = np.array(artifact.half)[:, None], centred / pitch
     plate = np.stack(pose.turned_back(step[0], step[1]))
     mark = np.clip(np.rint(plate), -half, half)
     away = np.abs(plate - mark)
     first = distances(away)
     second = np.minimum(np.hypot(1 - away[0], away[1]), np.hypot(away[0], 1 - away[1]))
-    return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch
+    return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, every
 
 
-def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndarray,
-            kinds: tuple[np.ndarray, np.ndarray], pitch: float,
+def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.ndarray,
+            kinds: tuple[np.ndarray, np.ndarray],
             rules: IdentityRules) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the estimate of the view's own motion, extended outwards from unambiguous marks.
 
@@ -163,23 +179,25 @@ def _settle(pose: StagePose, centred: np.ndarray, half: np.ndarray, ids: np.ndar
     are used only where the motion known so far cannot confuse them: around the named marks, or
     around the innermost one if none is named; the motion from these reaches further out.
     """
-    named, free = kinds
-    about = _about(pose, ids, pitch)
+    (named, free), pitch = kinds, artifact.grid_pitch_m
+    about = _about(pose, ids, artifact)
     use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
+    innermost = _innermost_of_list if artifact.marks else _innermost
     known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
-             _innermost(_rows(pose), centred[:, free], pitch, rules.max_rotation_rad))
+             innermost(_rows(pose), centred[:, free], artifact, rules.max_rotation_rad))
     while free.any():
         nominal = known.rigid.undo(centred)
-        nearest, ratio, _ = _nearest(pose, nominal, pitch, half)
-        sure = (known.error_at(nominal) <= SURE * pitch) & (ratio < 0.5)
+        nearest, ratio, _, apart = _nearest(pose, nominal, artifact)
+        sure = (known.error_at(nominal) <= SURE * np.minimum(pitch, apart)) & (ratio < 0.5)
         wider = named | (free & sure)
         if wider.sum() <= use.sum():
             break
         use, mark = wider, np.where(named, ids, nearest)
-        about = _about(pose, mark, pitch)
+        about = _about(pose, mark, artifact)
         fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
-    return (known, fit) if named.any() else _folded(_rows(pose), known, fit, pitch)
+    whole = named.any() or artifact.marks
+    return (known, fit) if whole else _folded(_rows(pose), known, fit, pitch)
 
 
 def _rows(pose: StagePose) -> StagePose:
@@ -187,9 +205,10 @@ def _rows(pose: StagePose) -> StagePose:
     return LatticePose(0, (0, 0), None) if isinstance(pose, LatticePose) else pose
 
 
-def _innermost(rows: StagePose, centred: np.ndarray, pitch: float,
+def _innermost(rows: StagePose, centred: np.ndarray, artifact: Artifact,
                max_rotation_rad: float) -> rigids.MotionEstimate:
     """Return the offset at the innermost mark from marks around it, up to whole pitches."""
+    pitch = artifact.grid_pitch_m
     if not centred.shape[1]:
         return rigids.MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
@@ -199,6 +218,31 @@ def _innermost(rows: StagePose, centred: np.ndarray, pitch: float,
     x, y = map(float, rows.turned(*offset))
     return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
                           max_rotation_rad)
+
+
+def _innermost_of_list(pose: StagePose, centred: np.ndarray, artifact: Artifact,
+                       max_rotation_rad: float) -> rigids.MotionEstimate:
+    """Return the offset with which most detections near the innermost one lie on marks of a list.
+
+    The smallest one of those with nearly as many: a list may have parts like a lattice.
+    """
+    pitch, marks = artifact.grid_pitch_m, artifact.marks
+    if not centred.shape[1] or marks is None:
+        return rigids.MotionEstimate(phi_error_rad=max_rotation_rad)
+    nearest = np.argsort(np.hypot(*centred), kind="stable")
+    centre = centred[:, nearest[0]]
+    near = centred[:, nearest]
+    near = near[:, np.hypot(*(near - centre[:, None])) * max_rotation_rad <= SURE * pitch]
+    some = np.stack(pose.turned_back(*near[:, :LOOKED_AT]))
+    among = marks.tree.query(some.T, CANDIDATES)[1]
+    offsets = (some[:, :, None] - marks.places_m[:, among]).reshape(2, -1)
+    there = some[:, None] - offsets[:, :, None]
+    hits = (marks.tree.query(there.reshape(2, -1).T)[0].reshape(len(offsets[0]), -1)
+            < ON_MARK * pitch).sum(axis=1)
+    away = np.where(hits >= 0.9 * hits.max(), np.hypot(*offsets), np.inf)
+    x, y = map(float, pose.turned(*offsets[:, int(away.argmin())]))
+    return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])),
+                                 ON_MARK * pitch, max_rotation_rad)
 
 
 def _folded(rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit,
@@ -217,8 +261,8 @@ def _folded(rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit,
     return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
 
 
-def _about(pose: StagePose, marks: np.ndarray, pitch: float) -> np.ndarray:
-    return np.stack(pose.turned(marks[0], marks[1])) * pitch
+def _about(pose: StagePose, marks: np.ndarray, artifact: Artifact) -> np.ndarray:
+    return np.stack(pose.turned(*artifact.places(*marks))) * artifact.grid_pitch_m
 
 
 def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *, ids: np.ndarray,

@@ -2,17 +2,23 @@
 """Plans and results from files, and the estimator's options from the settings of the solver."""
 
 from pathlib import Path
+from typing import Any
 
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.files import read_yaml
+from selfcal_ros.files import csv_cells, read_text, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 from selfcal_ros.model.view import Plan, plan_from_dict, plan_to_dict
 from selfcal_ros.results import read_result
+
+MOST_BYTES = 4_000_000
+"""Largest file with a list of marks."""
+_KIND = {"id": "whole number", "x": "number", "y": "number"}
 
 
 def read_plan(path: str | Path) -> Plan:
@@ -33,12 +39,13 @@ def plan_of(data: object, where: str, folder: Path) -> Plan:
     ----------
     data : object
         As `plan_from_dict` has it; ``artifact`` and ``map`` are those of the result in
-        ``artifact_from`` unless they are given.
+        ``artifact_from`` unless they are given, and ``marks`` may be the name of a CSV.
     where : str
         File name, for messages.
     folder : Path
         Folder in which relative names of results begin.
     """
+    data = _with_marks(data, where, folder)
     if not isinstance(data, dict) or not isinstance(data.get("artifact_from"), str):
         return plan_from_dict(data, where)
     source = str((folder / data["artifact_from"]).resolve())
@@ -46,6 +53,46 @@ def plan_of(data: object, where: str, folder: Path) -> Plan:
         Plan("", calibration_of(source).plate, ()))
     plate = {key: known[key] for key in ("artifact", "map") if key in known}
     return plan_from_dict(plate | data | {"artifact_from": source}, where)
+
+
+def _with_marks(data: object, where: str, folder: Path) -> object:
+    """Return the mapping of a plan with its list of marks in place of the name of the file."""
+    plate = data.get("artifact") if isinstance(data, dict) else None
+    if not isinstance(data, dict) or not isinstance(plate, dict) or not isinstance(
+            plate.get("marks"), str):
+        return data
+    for key in ("grid_size", "grid_pitch"):
+        if key in plate:
+            raise InputError(f"{where}: artifact", f"marks and {key} are both given",
+                             "leave one of them out")
+    path = folder / plate["marks"]
+    return data | {"artifact": plate | {"marks": _marks_in(read_text(path, MOST_BYTES), str(path))}}
+
+
+def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
+    """Return the columns id, x and y of a list of marks, m."""
+    lines = [(f"{where}:{number}", line) for number, line in enumerate(text.splitlines(), 1)
+             if line.strip(", ") and not line.startswith("#")]
+    head = [cell.lower().removesuffix("_m") for cell in csv_cells(lines[0][1], lines[0][0])
+            ] if lines else []
+    missing = [name for name in ("id", "x", "y") if name not in head]
+    if missing:
+        raise InputError(f"{where}:1", f"no column {', '.join(missing)}",
+                         "begin with the line id,x,y (x and y in m)")
+    columns: dict[str, list[Any]] = {"id": [], "x": [], "y": []}
+    for place, line in lines[1:]:
+        cells = csv_cells(line, place)
+        if len(cells) != len(head):
+            raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
+        for name, values in columns.items():
+            cell = cells[head.index(name)]
+            try:
+                values.append(int(cell) if name == "id" else float(cell))
+            except ValueError:
+                raise InputError(place, f"{name} '{cell}' is no {_KIND[name]}",
+                                 "correct the line") from None
+    marks_of(columns["id"], columns["x"], columns["y"], where=[place for place, _ in lines[1:]])
+    return columns
 
 
 def calibration_of(path: str) -> CalibrationResult:

@@ -131,7 +131,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     system = system_behind(result)
     if system is None or _lacks_terms(result):
         return float("nan"), float("nan")
-    length = result.plate.grid_pitch_m * max(result.plate.half)
+    length = result.plate.grid_pitch_m * max(result.plate.reach)
     if tells_what_was_read(result):
         variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
         shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
@@ -178,7 +178,7 @@ def _field(system: NormalEquations) -> FieldCovariance:
 
 def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
     """Return the covariance of the map for unit noise, without terms of the model."""
-    length, scale = result.plate.grid_pitch_m * max(result.plate.half), None
+    length, scale = result.plate.grid_pitch_m * max(result.plate.reach), None
     if result.reference is not None:
         scale = scale_datum(system, ReferenceLength(**result.reference), length)
     return FieldCovariance(system, bounded_inverse(result, system), scale, result.noise.sigma_xy)
@@ -186,7 +186,7 @@ def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCov
 
 def bounded_inverse(result: CalibrationResult, system: NormalEquations) -> np.ndarray:
     """Return the covariance of the misalignments of a result for unit noise of a grid reading."""
-    length = result.plate.grid_pitch_m * max(result.plate.half)
+    length = result.plate.grid_pitch_m * max(result.plate.reach)
     return system.inverse(bounded_ratio(system, result.noise.sigma_xy, result.noise.sigma_theta,
                                         length) if system.angular.n_views else 1.0)
 

@@ -268,6 +268,9 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
         if one != other:
             raise InputError(f"{names[0]} and {names[1]}", f"the lattices differ: {one} and "
                              f"{other} {what}", "compare maps of the same plate")
+    if a.marks != b.marks:
+        raise InputError(f"{names[0]} and {names[1]}", "the lists of marks differ",
+                         "compare maps of the same plate")
     if abs(a.grid_pitch_m - b.grid_pitch_m) > PITCH_TOLERANCE * a.grid_pitch_m:
         raise InputError(f"{names[0]} and {names[1]}", "the lattices differ: pitches of "
                          f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",

@@ -59,7 +59,7 @@ class Together:
     @property
     def length_m(self) -> float:
         """Longer half width of the plate."""
-        return self.result.plate.grid_pitch_m * max(self.result.plate.half)
+        return self.result.plate.grid_pitch_m * max(self.result.plate.reach)
 
     @cached_property
     def _both(self) -> BothCovariance:

@@ -79,7 +79,7 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength | None) -
     z, known = system.grid.views.z, system.known_marks
     if reference is None or reference.marks is None:
         return Gauge(z, known, scale=True).dual(3)
-    first, second = ((m + z.shape[0] // 2, n + z.shape[1] // 2) for m, n in reference.marks)
+    first, second = (system.grid.views.index_of(*mark) for mark in reference.marks)
     for mark, at in zip(reference.marks, (first, second), strict=True):
         if not known[at]:
             raise InputError("reference length", f"the mark {mark} was not measured",

@@ -138,7 +138,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         if not identifies(plan.artifact, plan.views):
             seen = with_unseen_modes(seen, system, plan).observability
         raise NotIdentifiableError(refusal(seen), seen)
-    half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.half)
+    half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
     direct = system.direct or bool(options.uncertainty) or bool(options.terms)
     if direct and system.grid.n_sites > MAX_DIRECT_SITES:

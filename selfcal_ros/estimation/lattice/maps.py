@@ -100,10 +100,13 @@ class LatticeViews:
         """Marks along x and y."""
         return self.shape
 
-    @property
-    def plate_half(self) -> tuple[int, int]:
-        """Largest m and n."""
-        return self.half
+    def mark_at(self, i: int, j: int) -> tuple[int, int]:
+        """Return the m and n of a mark by its index."""
+        return int(i) - self.half[0], int(j) - self.half[1]
+
+    def index_of(self, m: int, n: int) -> tuple[int, int]:
+        """Return the index of a mark."""
+        return m + self.half[0], n + self.half[1]
 
     @cached_property
     def phases(self) -> np.ndarray:
@@ -252,13 +255,14 @@ def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> AnyViews:
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
     """Return R^q m of the marks read, from the plate's centre, complex (P,), stage frame, m."""
     turn = pose_of(view.view, artifact).phase
-    return turn * (view.m + 1j * view.n) * artifact.grid_pitch_m
+    x, y = artifact.places(view.m, view.n)
+    return turn * (x + 1j * y) * artifact.grid_pitch_m
 
 
 def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
     """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where unknown."""
     turn = pose_of(view.view, artifact).phase
-    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    at = artifact.index(view.m, view.n)
     return turn * (plate.ax[at] + 1j * plate.ay[at])
 
 

@@ -173,8 +173,7 @@ class PlacedViews:
         self.spline = spline or MapSpline.of(
             artifact.field, grid.interpolation if grid else Interpolation.BICUBIC)
         self.shape, self.half = self.spline.shape, artifact.field.half
-        self.plate_shape, self.plate_half = artifact.shape, artifact.half
-        self.unit = max(artifact.half)
+        self.plate_shape, self.unit = artifact.shape, max(artifact.reach)
 
     @cached_property
     def phases(self) -> np.ndarray:
@@ -189,7 +188,8 @@ class PlacedViews:
     @cached_property
     def z(self) -> np.ndarray:
         """Mark positions in the unit, complex (nx, ny)."""
-        return (self.artifact.m + 1j * self.artifact.n) / self.unit
+        x, y = self.artifact.places(self.artifact.m, self.artifact.n)
+        return (x + 1j * y) / self.unit
 
     @cached_property
     def z_sites(self) -> np.ndarray:
@@ -240,6 +240,16 @@ class PlacedViews:
         i, j = (np.clip(np.rint(part).astype(int), 0, size - 1)
                 for part, size in zip(self.from_corner, self.shape, strict=True))
         return np.where(self.in_field, i * self.shape[1] + j, -1)
+
+    def mark_at(self, i: int, j: int) -> tuple[int, int]:
+        """Return the m and n of a mark by its index."""
+        m, n = self.artifact.marks_at(np.array(i), np.array(j))
+        return int(m), int(n)
+
+    def index_of(self, m: int, n: int) -> tuple[int, int]:
+        """Return the index of a mark."""
+        i, j = self.artifact.index(np.array(m), np.array(n))
+        return int(i), int(j)
 
     def near(self, nodes: np.ndarray) -> np.ndarray:
         """Return the marks whose cell of the map has only `nodes` as corners, (views, nx, ny)."""

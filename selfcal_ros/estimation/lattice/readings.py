@@ -41,7 +41,8 @@ class MapPose:
     @cached_property
     def sites(self) -> np.ndarray:
         """Nominal places of the marks, (2, nx, ny), pitches of the plate."""
-        return np.stack(self.pose.site_of(self.artifact.m, self.artifact.n))
+        artifact = self.artifact
+        return np.stack(self.pose.site_of(*artifact.places(artifact.m, artifact.n)))
 
     @cached_property
     def in_field(self) -> np.ndarray:
@@ -175,11 +176,11 @@ def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
 def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: AnyPose, *,
                 where: str) -> np.ndarray:
     """Return the flat index of every mark read, checked for plate and field."""
-    (hx, hy), m, n = artifact.half, np.asarray(readings.m), np.asarray(readings.n)
+    m, n = np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
         raise InputError(where, "m and n differ in length", "give one value a mark")
-    off_plate = (np.maximum(m, -m) > hx) | (np.maximum(n, -n) > hy)
-    flat = np.where(off_plate, 0, (m + hx) * artifact.shape[1] + (n + hy))
+    off_plate = ~artifact.has(m, n)
+    flat = np.where(off_plate, 0, artifact.flat(m, n))
     off_field = ~in_field(pose, artifact).reshape(-1)[flat]
     for name, bad in (("off the plate", off_plate), ("off the stage's field", off_field)):
         if bad.any():

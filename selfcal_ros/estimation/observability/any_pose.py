@@ -52,7 +52,7 @@ def start_poses(reach: float) -> list[Pose]:
 
 def reach_of(artifact: Artifact) -> float:
     """Return the largest shift to be tried on a plate, in pitches."""
-    return max(1.0, round(REACH * (min(artifact.shape) - 1), 1))
+    return max(1.0, round(REACH * (2 * min(artifact.reach)), 1))
 
 
 def best_pose(starts: Sequence[Pose], reach: float,

@@ -29,6 +29,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import Plan, View, with_sub_views
+from selfcal_ros.units import MM_PER_M
 
 SEARCH_SIZE = 9
 """Largest field for the search of a curing view, which is then verified on the real field."""
@@ -144,7 +145,8 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True,
                   angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0))
              for (a, b), name in names.items() for q in range(4)
-             if q % 2 == 0 or artifact.shape[0] == artifact.shape[1] or (a, b) == (0, 0)]
+             if q % 2 == 0 or artifact.marks or artifact.shape[0] == artifact.shape[1]
+             or (a, b) == (0, 0)]
     if angular and artifact.angular_count:
         line = 2 * math.pi / artifact.angular_count
         views.append(View("one_line", line, (0.0, 0.0), False, True) if not artifact.harmonics else
@@ -188,8 +190,10 @@ def smaller(plan: Plan, size: int) -> Plan:
     """Return the plan on a field of at most `size` sites per side, with the same turns and shifts.
 
     The field keeps its proportions, on which the uncertainty of a long field depends, and is
-    large enough for the plan's own shifts.
+    large enough for the plan's own shifts. A list of marks remains as it is.
     """
+    if plan.artifact.marks:
+        return plan
     reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
              for view in with_sub_views(plan.views)]
     room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
@@ -204,7 +208,7 @@ def smaller(plan: Plan, size: int) -> Plan:
 
 
 def describe_view(view: View, artifact: Artifact) -> str:
-    """Return a view in words: turn, shift in pitches, kind of marks, repeats."""
+    """Return a view in words: turn, shift in pitches (mm), kind of marks, repeats."""
     turn = math.degrees(view.rotation_rad) % 360
     if not view.grid:
         lines = view.on_stage(artifact).turn_lines or 0
@@ -215,8 +219,9 @@ def describe_view(view: View, artifact: Artifact) -> str:
         what = f"a view turned by {turn:.6g} deg"
     else:
         what = "a view without turn"
-    steps = [round(shift / artifact.grid_pitch_m, 3) + 0.0 for shift in view.translation_m]
-    shifted = [f"{step:+g} pitch along {axis}" for step, axis in zip(steps, "XY", strict=True)
+    unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
+    steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
+    shifted = [f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True)
                if step]
     return what + (" and shifted by " + " and ".join(shifted) if shifted else "")
 

@@ -112,7 +112,7 @@ def _theta_parts(system: NormalEquations, artifact: Artifact, datum: ThetaDatum,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
     """Return the lines' response to free rotations, their covariance, and the datum's columns."""
     angular = system.angular
-    half_width_m = artifact.grid_pitch_m * max(artifact.half)
+    half_width_m = artifact.grid_pitch_m * max(artifact.reach)
     conditions = conditions_for(system, ThetaDatum(datum), sense, half_width_m)
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     inner = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)

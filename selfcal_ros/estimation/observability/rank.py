@@ -19,6 +19,7 @@ from selfcal_ros.estimation.normal.systems import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.units import MM_PER_M
 
 DATUM_ROWS = 7
 """Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
@@ -176,24 +177,29 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
     """Return advice on the missing views of a deficient plan: a quarter turn, a shift, a line."""
     views = tuple(views)
     poses = [view.pose for view in views if view.grid]
-    advice = []
+    advice, step = [], one_pitch(artifact)
     if len({round((pose.turn_rad / math.pi) % 1, 6) % 1 for pose in poses}) < 2:
         advice.append("add a view turned by 90 deg")
     if len({(round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
             for x, y in (pose.shift_m for pose in poses)}) < 2:
-        advice.append("add a view shifted by one pitch along X")
+        advice.append(f"add a view shifted by {step} along X")
     if any(view.angular for view in views) and artifact.angular_count:
         advice += _lines_advice(artifact, [v.on_stage(artifact).turn_lines or 0
                                            for v in views if v.angular])
     return tuple(advice) or _tried(artifact, views)
 
 
+def one_pitch(artifact: Artifact) -> str:
+    """Return a shift by one pitch in words; of a list of marks, by their distance."""
+    return f"{artifact.grid_pitch_m * MM_PER_M:.2g} mm" if artifact.marks else "one pitch"
+
+
 def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
     """Return the first single view, by trial, that cures the plan."""
     pitch = artifact.grid_pitch_m
     if artifact.map_grid is not None:
-        return ("add views turned by 90 deg and shifted by about one pitch, or give the map "
-                "fewer nodes",)
+        return (f"add views turned by 90 deg and shifted by about {one_pitch(artifact)}, or give "
+                "the map fewer nodes",)
     for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
                               ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
                               ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),

@@ -233,7 +233,7 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
 
     Turning stage and plate together renames sites and marks; so does mirroring both; turning the
     plate in all views renames the marks. A field that is not square has half of these symmetries.
-    The uncertainty of XY is the same; that of theta need not be.
+    The uncertainty of XY is the same; that of theta need not be. A list of marks has no symmetry.
 
     Parameters
     ----------
@@ -246,7 +246,8 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     steps = [(round(pose.turn_rad / (math.pi / 2), 9) % 4, complex(
         *(round(shift / artifact.grid_pitch_m, 6) for shift in pose.shift_m))) for pose in poses]
     turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
-    forms = list(product((False, True), turns, turns))
+    forms = list(product((False, True), turns, turns)) if artifact.marks is None else [
+        (False, 0, 0)]
     return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)
 
 

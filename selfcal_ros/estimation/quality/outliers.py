@@ -273,8 +273,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
         if above > (1 + TIED) * ratio[v, i, j]:
             continue
         taken |= {node: float(ratio[v, i, j]) for node in nodes if node not in taken}
-        index, (hx, hy) = problem.grid.index[v], grid.views.plate_half
-        mark = (int(i) - hx, int(j) - hy)
+        index, mark = problem.grid.index[v], grid.views.mark_at(i, j)
         found[index, "grid", mark] = Removed(
             measurements.views[index].view.name, "grid", mark, float(np.sqrt(ratio[v, i, j])),
             float(1 - residuals.redundancy[v, i, j]),
@@ -333,8 +332,8 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     index, kind, mark = key
     at: tuple[int, ...]
     if kind == "grid":
-        hx, hy = residuals.problem.system.grid.views.plate_half
-        at = (residuals.problem.grid.index.index(index), mark[0] + hx, mark[1] + hy)
+        views = residuals.problem.system.grid.views
+        at = (residuals.problem.grid.index.index(index), *views.index_of(*mark))
     else:
         at = (residuals.problem.angular.index.index(index), *mark)
     # NaN: a reading that cannot be checked does not agree
@@ -357,11 +356,12 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
         return measurements
     model = fit_joint(measurements, options)
     problem = model.problem
-    views, (hx, hy) = list(measurements.views), measurements.artifact.half
+    views = list(measurements.views)
     for row, index in enumerate(problem.grid.index):
         view = views[index]
         marks = problem.system.grid.views.z * problem.half_width_m
         flat = model.y[row] + 1j * problem.turn_rad[row] * marks
-        linear = flat[view.m + hx, view.n + hy] * problem.grid.poses[row].phase
+        at = measurements.artifact.index(view.m, view.n)
+        linear = flat[at] * problem.grid.poses[row].phase
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))

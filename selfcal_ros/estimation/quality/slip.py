@@ -126,12 +126,12 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
     size = abs(residuals.found.residuals)
     clipped = residuals.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
     for v, i in enumerate(residuals.problem.grid.index):
-        for axis in (0, 1):
+        for axis in (0, 1) if measurements.artifact.marks is None else ():
             for place in _places(grid.read[v], axis):
                 gain = _explained(residuals, clipped, v, axis, place)
                 if gain is not None and gain / sigma_m**2 >= chdtri(3, SLIP_LEVEL):
                     found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
-                                           int(place) - grid.views.plate_half[axis],
+                                           grid.views.mark_at(place, place)[axis],
                                            gain / sigma_m**2))
     found.sort(key=lambda slip: -slip.chi2)
     return _best(found[:TRIED], measurements, options)

@@ -161,7 +161,7 @@ def _held_out(measurements: Measurements, options: Options,
     errors, angles = [], []
     known_at, error_at = np.zeros(of.grid.weight.shape, dtype=bool), np.zeros_like(of.grid.y)
     for index, view in enumerate(held.views):
-        at = view.m + measurements.artifact.half[0], view.n + measurements.artifact.half[1]
+        at = measurements.artifact.index(view.m, view.n)
         more = of_terms(model, of, index, at)
         less = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag,
                        dtheta=view.dtheta - of_line_terms(model, index, view.k))
@@ -275,7 +275,7 @@ def _grid_errors(measurements: Measurements, result: CalibrationResult,
         field = -field[::-1, ::-1]
     pose = pose_of(view.view, artifact)
     at_marks = pose.phase * maps_of(artifact.shape, (pose,)).gather(field)[0]
-    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    at = artifact.index(view.m, view.n)
     return (view.dx + 1j * view.dy - at_marks[at]
             - turned_plate(view, artifact, result.artifact_map))
 

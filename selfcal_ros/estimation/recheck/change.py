@@ -105,7 +105,8 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
         If they are of another plate.
     """
     mine, other = measurements.artifact, plate.result.plate
-    if (mine.shape, mine.angular_count) != (other.shape, other.angular_count) or abs(
+    if (mine.shape, mine.angular_count, mine.marks) != (
+            other.shape, other.angular_count, other.marks) or abs(
             mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
         raise InputError(plate.where, f"its plate has {_said(other)}, the one that was read "
                          f"{_said(mine)}", "name the result of this plate")
@@ -118,6 +119,8 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
 
 def _said(artifact: Artifact) -> str:
     nx, ny = artifact.shape
+    if artifact.marks:
+        return f"a list of {nx} marks and {artifact.angular_count} lines"
     return (f"{nx} x {ny} marks {artifact.grid_pitch_m * MM_PER_M:g} mm apart and "
             f"{artifact.angular_count} lines")
 

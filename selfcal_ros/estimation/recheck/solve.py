@@ -92,7 +92,7 @@ class Rechecked:
         variance = np.sum(list(new.variances(plate).values()), axis=0).reshape(xy.shape)
         (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan)
                                 for values in (xy, np.sqrt(variance)))
-        length = artifact.grid_pitch_m * max(artifact.half)
+        length = artifact.grid_pitch_m * max(artifact.reach)
         z = (artifact.x_m + 1j * artifact.y_m) / length
         o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(gx + 1j * gy))
         theta = self.lines.values
@@ -164,7 +164,7 @@ def plate_readings(measurements: Measurements, options: Options,
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
     artifact, system = measurements.artifact, system_for(grid, angular)
-    views, length = system.grid.views, artifact.grid_pitch_m * max(artifact.half)
+    views, length = system.grid.views, artifact.grid_pitch_m * max(artifact.reach)
     ground = ground_of(measurements, grid, length)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
     lines, shape = artifact.angular_count, views.z_sites.shape

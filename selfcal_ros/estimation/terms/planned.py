@@ -102,7 +102,7 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                    for row, view in zip(placed, grid_views, strict=True))
     lines = [views[i] for i in system.angular_index]
     shared = tuple(row for row, view in enumerate(lines) if view.grid)
-    return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.half),
+    return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.reach),
                   system.grid.weight, visits, tuple(view.name for view in grid_views),
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
@@ -124,13 +124,15 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    (hx, hy), pose = artifact.half, view.on_stage(artifact)
+    pose = view.on_stage(artifact)
     phase = PHASES[-pose.q % 4] if isinstance(pose, LatticePose) else view.pose.phase.conjugate()
-    mark = (found.m + hx) * artifact.shape[1] + found.n + hy
-    i, j = (np.clip(np.rint(at), -h, h).astype(int) + h  # the nearest, off the lattice
-            for at, h in ((found.i, hx), (found.j, hy)))
-    stage, plate = errors[0, i, j], errors[1].ravel()[mark] / phase
-    arm = (found.m + 1j * found.n) * artifact.grid_pitch_m / phase
+    mark = artifact.flat(found.m, found.n)
+    near = mark if artifact.marks else artifact.flat(*(
+        np.clip(np.rint(at), -h, h).astype(int)  # the nearest, off the lattice
+        for at, h in zip((found.i, found.j), artifact.half, strict=True)))
+    stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] / phase
+    u, v = artifact.places(found.m, found.n)
+    arm = (u + 1j * v) * artifact.grid_pitch_m / phase
     offset = np.expm1(1j * turn) * arm + complex(x, y) + plate - stage - stops - aside
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign

@@ -105,7 +105,8 @@ def visits_of(measurements: Measurements, grid: GridData,
     """
     views = [measurements.views[i] for i in grid.index]
     ranges = time_ranges(views, placings)
-    return tuple(_visits_of(view, grid, row, ranges.get(placings[row]))
+    return tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
+                            measurements.artifact.flat(view.m, view.n))
                  for row, view in enumerate(views))
 
 
@@ -121,13 +122,12 @@ def time_ranges(views: Iterable[ViewReadings],
     return out
 
 
-def _visits_of(view: ViewReadings, grid: GridData, row: int,
-               ends: tuple[int, int] | None) -> ViewVisits | None:
+def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None,
+               flat: np.ndarray) -> ViewVisits | None:
+    """Return the visits of a view whose marks have the indices `flat` (P,)."""
     visits = view.visits
     if visits is None or not len(visits.mark) or ends is None:
         return None
-    hx, hy = (size // 2 for size in grid.y.shape[1:])
-    flat = (view.m + hx) * grid.y.shape[2] + (view.n + hy)
     mark = flat[visits.mark]
     own = _own_weights(visits, mark, grid.y[row].size)
     total = np.bincount(mark, own, grid.y[row].size)

@@ -324,8 +324,8 @@ def _with_readings(model: ModelFit, ground: TermInputs, columns: TermColumns,
     phases = model.problem.system.grid.views.phases.conj()
     single, suspects = reading_columns(ground, model.found.residuals, phases)
     return _with(ground, (columns, groups), single, [
-        Group(READING, s.rows, s.view, places=int(np.count_nonzero(ground.weight)), mark=s.mark)
-        for s in suspects])
+        Group(READING, s.rows, s.view, places=int(np.count_nonzero(ground.weight)),
+              mark=model.problem.system.grid.views.mark_at(*s.place)) for s in suspects])
 
 
 def select_explanations(pool: Candidates, groups: list[Group],

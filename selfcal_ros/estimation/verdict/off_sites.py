@@ -33,10 +33,10 @@ MOST = 6
 
 
 class Suspect(NamedTuple):
-    """A reading that may be faulty: its grid view, its mark (m, n), and a mask of its columns."""
+    """A reading that may be faulty: its grid view, its mark's place, and a mask of its columns."""
 
     view: int
-    mark: tuple[int, int]
+    place: tuple[int, int]
     rows: np.ndarray
 
 
@@ -68,7 +68,6 @@ def reading_columns(ground: TermInputs, residuals: np.ndarray,
     largest = np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]
     at = [place for place in zip(*np.unravel_index(largest, squares.shape), strict=True)
           if squares[place] >= 0]
-    half = ((squares.shape[1] - 1) // 2, (squares.shape[2] - 1) // 2)
     means, columns, found = [], [], []
     for number, (view, i, j) in enumerate(at):
         mean = np.zeros(squares.shape[1:], dtype=complex)
@@ -76,7 +75,7 @@ def reading_columns(ground: TermInputs, residuals: np.ndarray,
         means.append({int(view): mean.reshape(-1)})
         columns += [Column(READING, int(view), axis, np.inf) for axis, _ in AXES]
         rows = np.arange(2 * len(at)) // 2 == number
-        found.append(Suspect(int(view), (int(i) - half[0], int(j) - half[1]), rows))
+        found.append(Suspect(int(view), (int(i), int(j)), rows))
     n, units = 2 * len(at), [unit for _, unit in AXES]
     shapes = shapes_of(means, [column // 2 for column in range(n)], units * len(at), ground.weight)
     nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), 0.0, 0)

@@ -167,7 +167,7 @@ def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray])
     pitch = artifact.grid_pitch_m * MM_PER_M
     x, y = (min(max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
                 (half + 4) * pitch)
-            for half, ends in zip(artifact.half, np.concatenate(ends_mm, axis=1), strict=True))
+            for half, ends in zip(artifact.reach, np.concatenate(ends_mm, axis=1), strict=True))
     return draw.Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
 
 
@@ -185,7 +185,7 @@ def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
 def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
     """Add tooltips with the values of each site, unless the field is too large."""
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
-    if max(artifact.shape) > MAX_SPOTS:
+    if artifact.m.size > MAX_SPOTS**2:
         return
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
     for index in np.ndindex(artifact.shape):

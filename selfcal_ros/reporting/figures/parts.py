@@ -46,12 +46,17 @@ def map_frame(drawing: draw.Drawing, artifact: Artifact,
     `box` is left, top and width in pixels; the height follows from the shape of the plate.
     """
     left, top, width = box
-    x, y = ((half + 0.5) * artifact.grid_pitch_m * MM_PER_M for half in artifact.half)
+    x, y = ((half + 0.5) * artifact.grid_pitch_m * MM_PER_M for half in artifact.reach)
     return draw.Frame(drawing, (left, top, width, width * y / x), (-x, x), (-y, y))
 
 
 def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
-    """Return slices that keep at most `most` sites per side, including the centre."""
+    """Return slices that keep at most `most` sites per side, including the centre.
+
+    Of a list of marks as many as of such a lattice.
+    """
+    if artifact.marks:
+        return slice(0, None, max(1, math.ceil(artifact.shape[0] / most**2))), slice(0, None, None)
     step = max(1, math.ceil(max(artifact.shape) / most))
     half_x, half_y = artifact.half
     return slice(half_x % step, None, step), slice(half_y % step, None, step)

@@ -63,13 +63,13 @@ def views_in(result: CalibrationResult) -> list[View]:
 
 def _corners(artifact: Artifact) -> np.ndarray:
     """Return the outline of the plate, plate frame, (2, 5), m."""
-    half = np.array(artifact.half)[:, None]
+    half = np.array(artifact.reach)[:, None]
     return np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * artifact.grid_pitch_m
 
 
 def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     drawing, pitch = frame.drawing, artifact.grid_pitch_m
-    half = np.array(artifact.half)[:, None]
+    half = np.array(artifact.reach)[:, None]
     field = [(reach + 0.3 * pitch) * MM_PER_M for reach in artifact.field_half_m]
     low, high = frame.at(-field[0], -field[1]), frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
@@ -78,8 +78,8 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
     if view.grid:
         pose = view.on_stage(artifact)
-        on = ~pose.beyond_field(np.stack(pose.site_of(artifact.m[sites], artifact.n[sites])),
-                                artifact)
+        marks = artifact.places(artifact.m[sites], artifact.n[sites])
+        on = ~pose.beyond_field(np.stack(pose.site_of(*marks)), artifact)
         drawing.discs(_at(frame, place[:, on]), 1.4, fill="ink")
         drawing.discs(_at(frame, place[:, ~on]), 1.6, stroke="bad")
     else:
@@ -142,8 +142,11 @@ def _number(value: object) -> bool:
 def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[Place]:
     if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
         return []
-    m, n = (np.array(part * result.plate.grid_pitch_m) for part in mark)
-    x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), m, n)
+    m, n = (np.array(part) for part in mark)
+    if result.plate.marks and not result.plate.has(m, n):
+        return []
+    at = (part * result.plate.grid_pitch_m for part in result.plate.places(m, n))
+    x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), *at)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 
 

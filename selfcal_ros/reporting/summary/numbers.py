@@ -239,8 +239,8 @@ def map_figures(emap: ErrorMap) -> MapFigures:
 def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | None:
     if index is None:
         return None
-    half = emap.artifact.half
-    return index[0] - half[0], index[1] - half[1]
+    m, n = emap.artifact.marks_at(*map(np.array, index))
+    return int(m), int(n)
 
 
 def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigures:

@@ -110,14 +110,14 @@ def measurement_section(result: CalibrationResult) -> Section:
     """Return plan, plate, method and input."""
     artifact = result.plate
     (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM_PER_M
-    plate = (f"{nx} × {ny} marks, pitch {pitch:.6g} mm, "
-             f"field {(nx - 1) * pitch:.6g} × {(ny - 1) * pitch:.6g} mm, "
-             + (f"{artifact.angular_count} angular lines" if artifact.angular_count
-                else "no angular lines"))
+    marks = (f"list of {nx} marks, neighbours {pitch:.6g} mm apart (median)" if artifact.marks else
+             f"{nx} × {ny} marks, pitch {pitch:.6g} mm")
+    x, y = (2 * half * pitch for half in artifact.reach)
     seen = result.observability
     views = f"{counted(len(result.views), 'view')}, {views_done(result)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
-             ("plate", plate),
+             ("plate", f"{marks}, field {x:.6g} × {y:.6g} mm, "
+              f"{artifact.angular_count or 'no'} angular lines"),
              *([("map", _nodes(artifact.map_grid, artifact.field.shape))]
                if artifact.map_grid else []),
              *([("angular map", f"Fourier series, {counted(artifact.harmonics, 'harmonic')}")]
@@ -130,9 +130,8 @@ def measurement_section(result: CalibrationResult) -> Section:
     if math.isfinite(plate_map.magnification):
         value, u = (x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification))
         spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
-        word = "larger" if value >= 0 else "smaller"
-        facts.append(("magnification", f"plate {word} than the encoders say by "
-                      f"{significant(abs(value))}{spread} µm/m"))
+        facts.append(("magnification", f"plate {'larger' if value >= 0 else 'smaller'} than the "
+                      f"encoders say by {significant(abs(value))}{spread} µm/m"))
     if result.input.get("file"):
         digest = printable(result.input.get("sha256") or "")
         facts.append(("input", printable(result.input["file"])
@@ -154,21 +153,21 @@ def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
     artifact, views = result.plate, result.views
     columns = [[printable(v.name) for v in views],
-               [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact)
-                for v in views],
+               [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact) for v in views],
                fixed_column([v.phi / RAD_PER_MRAD for v in views]),
                fixed_column([v.tx * UM_PER_M for v in views]),
                fixed_column([v.ty * UM_PER_M for v in views]),
                [str(v.used) for v in views], [str(v.rejected) for v in views]]
-    header = ("view", "pose (pitches)", "φ mrad", "tx µm", "ty µm", "used", "rejected")
+    pose = f"pose ({'mm' if artifact.marks else 'pitches'})"
+    header = ("view", pose, "φ mrad", "tx µm", "ty µm", "used", "rejected")
     return Section("Views and their misalignment",
                    table=(header, *zip(*columns, strict=True)) if views else ())
 
 
 def pose_text(rotation_rad: float, translation_m: tuple[float, float], artifact: Artifact) -> str:
-    """Return a nominal pose as ``90° (+1, 0)``: turn and translation in pitches."""
-    steps = [f"{value / artifact.grid_pitch_m:+.6g}" for value in translation_m]
-    x, y = (step if float(step) else "0" for step in steps)
+    """Return a nominal pose as ``90° (+1, 0)``: turn, and pitches (mm for a list of marks)."""
+    unit = 1 / MM_PER_M if artifact.marks else artifact.grid_pitch_m
+    x, y = (f"{value / unit:+.6g}" if round(value / unit, 9) else "0" for value in translation_m)
     return f"{math.degrees(rotation_rad):.6g}° ({x}, {y})"
 
 
@@ -176,7 +175,8 @@ def position_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
     """Return the position of a site as ``at x 40 mm, y -20 mm``; empty for None."""
     if site is None:
         return ""
-    x, y = (f"{index * emap.artifact.grid_pitch_m * MM_PER_M:.6g}" for index in site)
+    pitch, at = emap.artifact.grid_pitch_m, emap.artifact.places(*map(np.array, site))
+    x, y = (f"{float(part) * pitch * MM_PER_M:.6g}" for part in at)
     return f"at x {x} mm, y {y} mm"
 
 

@@ -111,7 +111,7 @@ def test_those_with_the_largest_residuals_are_tried():
     residuals = np.zeros(ground.weight.shape, dtype=complex)
     residuals[1, 0, 2], residuals[0, 1, 1] = 3e-8j, 2e-8
     columns, suspects = reading_columns(ground, residuals, np.array([1, -1j, 1]))
-    assert [(s.view, s.mark) for s in suspects[:2]] == [(1, (-1, 1)), (0, (0, 0))]
+    assert [(s.view, s.place) for s in suspects[:2]] == [(1, (0, 2)), (0, (1, 1))]
     assert len(suspects) == MOST and len(columns.columns) == 2 * MOST
     first = columns.grid[suspects[0].rows]
     assert np.count_nonzero(columns.grid) == 2 * MOST
