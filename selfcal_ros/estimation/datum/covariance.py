@@ -37,6 +37,8 @@ class ScaleDatum:
         Standard uncertainty of the reference itself, m at the unit of position.
     of_plate : bool
         Whether the plate sets the scale, so that terms acting on its marks change it.
+    dual : complex array (nx, ny), optional
+        Factors of the plate's map where that sets the scale.
     """
 
     rows: np.ndarray
@@ -44,6 +46,7 @@ class ScaleDatum:
     variance: float
     u_m: float
     of_plate: bool = False
+    dual: np.ndarray | None = None
 
 
 def scale_datum(system: NormalEquations, reference: ReferenceLength,
@@ -113,7 +116,7 @@ def scale_by_plate(system: NormalEquations, dual: np.ndarray, u_m: float = 0.0, 
     parameters = np.stack([sums[:, 0].real, sums[:, 1].real, sums[:, 1].imag], axis=1).ravel()
     total = grid.weight.sum(axis=0)
     variance = float((abs(dual) ** 2 / np.where(grid.mark_read, total, np.inf)).sum())
-    return ScaleDatum(rows, parameters, variance, u_m, of_plate=True)
+    return ScaleDatum(rows, parameters, variance, u_m, of_plate=True, dual=dual)
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,

@@ -9,7 +9,7 @@ noise make of them, the yaw of the stage fitted to them as to the readings.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,7 +27,10 @@ FEWEST, MOST = 24, 64
 
 @dataclass(frozen=True)
 class TwoNoises:
-    """Noises of one reading: common to the marks of an image, and of a mark, m; their sum's dof."""
+    """Noises of one reading: common to the marks of an image, and of a mark, m.
+
+    `dof` are the degrees of freedom of what both make of the map.
+    """
 
     image: float
     mark: float
@@ -98,6 +101,9 @@ class ImageNoise:
         that of images, and of both together less these.
     parameters : float array (draws, 2, 3 views)
         Misalignments for unit noise of marks and of images, as in `JointFit`, m.
+    gain : float
+        Variance of the map (mean over its nodes) for unit noise of images, over that for unit noise
+        of marks.
     yaw : FittedYaw, optional
         Of the draws, if the model has it.
     """
@@ -107,6 +113,7 @@ class ImageNoise:
     weight: np.ndarray
     drawn: np.ndarray
     parameters: np.ndarray
+    gain: float = 1.0
     yaw: FittedYaw | None = None
 
     @property
@@ -132,7 +139,7 @@ class ImageNoise:
             both[alone, 0] = 1 / expected[0, alone]
             found = both @ sums
         mark, image = np.sqrt(found)
-        scatter = (self.drawn @ [mark**2, image**2, mark * image]) @ both.sum(axis=0)
+        scatter = (self.drawn @ [mark**2, image**2, mark * image]) @ ([1, self.gain] @ both)
         spread = scatter.var(ddof=1)
         dof = 2 * scatter.mean() ** 2 / spread if spread else math.inf
         return TwoNoises(float(image), float(mark), float(dof))
@@ -194,7 +201,7 @@ def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
         values = np.zeros(grid.read.shape, dtype=complex)
         for view, of_marks in column.items():
             values[view] = of_marks.reshape(values[view].shape)
-        left.append(_solved(system, values[grid.read]))
+        left.append(_solved(system, values[grid.read])[:2])
     residuals, parameters = (np.array(part) for part in zip(*left, strict=True))
     flat = residuals[:, grid.read]
     gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
@@ -214,17 +221,19 @@ def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]]
     drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
     fitted = None if yaw is None else _fitted_yaw(system, yaw)
     plain = ImageNoise(stops, grid.read, weight, drawn,
-                       np.zeros((len(drawn), 2, 3 * len(views))), fitted)
+                       np.zeros((len(drawn), 2, 3 * len(views))), yaw=fitted)
+    power = np.zeros(2)
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):
         mark, image = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (
             len(stops), stops.max() + 1))
         solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
-        left, parameters[:] = zip(*(solved if fitted is None else [
-            fitted.freed(*one) for one in solved]), strict=True)
+        power += [one[2] for one in solved]
+        left, parameters[:] = zip(*(
+            one[:2] if fitted is None else fitted.freed(*one[:2]) for one in solved), strict=True)
         row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
         row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
-    return plain
+    return replace(plain, gain=float(power[1] / power[0]))
 
 
 def _stops(views: Sequence[tuple[str, tuple[int, int]]], read: np.ndarray) -> np.ndarray:
@@ -240,10 +249,11 @@ def _stops(views: Sequence[tuple[str, tuple[int, int]]], read: np.ndarray) -> np
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals (views, nx, ny) and misalignments, in the datum, of readings (n,).
+def _solved(system: NormalEquations,
+            values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return residuals (views, nx, ny), misalignments and square of the map of readings (n,).
 
-    Of the grid alone.
+    Of the grid alone, in the datum.
     """
     grid = system.grid
     y = np.zeros(grid.read.shape, dtype=complex)
@@ -256,4 +266,7 @@ def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np
     moved[:len(alone)] = alone
     moved -= system.gauge.parts(field) @ system.rigid[:4]
     moved -= system.plate_gauge.parts(plate) @ system.rigid[4:]
-    return residual, moved[:len(alone)]
+    flat = np.where(system.known_sites, field, 0).reshape(-1)
+    basis = system.gauge.orthonormal
+    in_datum = flat - basis @ np.real(basis.conj().T @ flat)
+    return residual, moved[:len(alone)], float((abs(in_datum)**2).sum())

@@ -9,7 +9,7 @@ solves the same factored equations (Gauss-Newton).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -338,15 +338,18 @@ class _State:
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
             self.theta = angular_part(self.problem)
 
-    def _of_terms(self) -> np.ndarray | float:
+    def _of_terms(self, names: Collection[str] | None = None) -> np.ndarray | float:
+        """Return what terms, all or those of `names`, make of the readings, (views, nx, ny), m."""
         if self.equations is None:
             return 0.0
-        return self.equations.columns.shapes.combined(self.coefficients)
+        rows = None if names is None else self.equations.rows(names)
+        return self.equations.columns.shapes.combined(self.coefficients, rows)
 
     def _excess(self) -> np.ndarray | float:
         """Return what finite rotations add to the linear model, in the frame of the plate, m.
 
-        What is left of the rotation there turns the plate; the rotation of the frame turns G.
+        What is left of the rotation there turns the plate; the rotation of the frame turns G, and
+        what the approach adds to it.
         """
         if not self.problem.rigid:
             return 0.0
@@ -355,14 +358,8 @@ class _State:
         turn = np.expm1(1j * phi)
         frame = np.expm1(-1j * self.problem.turn_rad)[:, None, None]
         return (turn - 1j * phi) * (grid.views.z * length) + turn * (
-            self.found.plate + self._of_plate()) + frame * grid.views.gather(self.found.field)
-
-    def _of_plate(self) -> np.ndarray | float:
-        """Return how the plate itself differs in each view, B, (views, nx, ny), m."""
-        if self.equations is None:
-            return 0.0
-        rows = self.equations.rows(OF_PLATE)
-        return self.equations.columns.shapes.combined(self.coefficients, rows)
+            self.found.plate + self._of_terms(OF_PLATE)) + frame * (
+                grid.views.gather(self.found.field) + self._of_terms((TermName.APPROACH,)))
 
     def _sums(self) -> Sums:
         if self.equations is not None:

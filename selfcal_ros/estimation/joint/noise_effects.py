@@ -66,7 +66,8 @@ def axis_variances(model: ModelFit, cover: FieldCovariance) -> np.ndarray:
 
 
 def added_variances(model: ModelFit, cover: FieldCovariance,
-                    of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+                    of: Callable[[np.ndarray], np.ndarray],
+                    columns: np.ndarray | None = None) -> np.ndarray:
     """Return `of` the sensitivities of each coordinate of the map, (2, nx, ny).
 
     Parameters
@@ -76,18 +77,55 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
     of : callable
         Sensitivities of k coordinates to the readings, over their weights, plate frame, complex
         (k, views, nx, ny) -> k variances for unit noise.
+    columns : complex array (p, views, nx, ny), optional
+        Columns of the terms in the equations of `cover`, where these are not those of the fit.
     """
-    grid = model.problem.system.grid
-    columns = None if model.equations is None else model.equations.columns.grid
-    out = np.zeros((2, grid.n_sites))
+    grid = cover.system.grid
+    if columns is None and model.equations is not None:
+        columns = model.equations.columns.grid
+    out, alone = np.zeros((2, grid.n_sites)), None
+    if cover.scale is not None and cover.scale.dual is not None:  # readings of marks in the scale
+        total = grid.weight.sum(axis=0)
+        alone = np.where(grid.read, cover.scale.dual / np.where(total > 0, total, 1), 0)
     for values, unit in zip(out, (1, 1j), strict=True):
         for start in range(0, grid.n_sites, CHUNK):
             rows = unit * np.eye(CHUNK, grid.n_sites, start)[:grid.n_sites - start]
             field, parameters, terms = cover.solved(rows.T)
             y = np.zeros(1) if columns is None else np.tensordot(terms.T, columns, axes=1)
             rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
+            if alone is not None:
+                grown = np.real(grid.views.z_sites.ravel().conj() @ rows.T)
+                rest = rest - grown[:, None, None, None] * alone
             values[start:start + CHUNK] = of(rest)
     return out.reshape(2, *grid.views.shape)
+
+
+def plate_variances(model: ModelFit, cover: FieldCovariance,
+                    of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return `of` the sensitivities of each coordinate of the plate's map, (2, nx, ny).
+
+    Parameters
+    ----------
+    model, of
+        As in `added_variances`; sensitivities of one view are turned alike.
+    cover : FieldCovariance
+        Of the plate's map, in the exchanged equations (method eq. 4.13).
+    """
+    views = model.problem.system.grid.views
+    at = views.site_index.reshape(len(views.phases), -1)
+    here = at >= 0
+    place = np.where(here, at, 0)
+
+    def of_marks(rest: np.ndarray) -> np.ndarray:
+        moved = np.take_along_axis(rest.reshape(len(rest), *at.shape), place[None], axis=2)
+        return of(np.where(here, moved, 0).reshape(rest.shape))
+
+    if model.equations is None:
+        return added_variances(model, cover, of_marks)
+    marks, (view, mark) = model.equations.columns.grid, np.nonzero(here)
+    columns = np.zeros((len(marks), *at.shape), dtype=complex)
+    columns[:, view, at[here]] = (marks.reshape(columns.shape)[:, view, mark] * views.phases[view])
+    return added_variances(model, cover, of_marks, columns.reshape(marks.shape))
 
 
 TESTED = 5

@@ -259,7 +259,8 @@ def turned(problem: Problem) -> Problem:
     marks = grid.views.z * length
     y = np.where(grid.read, frame[:, None, None] * problem.grid.y + bent[:, None, None] * marks, 0)
     visits = tuple(None if v is None else replace(
-        v, y=f * v.y + e * marks.reshape(-1)[v.mark], phase=v.phase * complex(f))
+        v, y=f * v.y + e * marks.reshape(-1)[v.mark], phase=v.phase * complex(f),
+        frame=v.frame * complex(f))
         for v, f, e in zip(problem.ground.visits, frame, bent, strict=True))
     lines = problem.angular.y.copy()
     for row, index in enumerate(problem.angular.index):

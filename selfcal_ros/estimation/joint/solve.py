@@ -38,6 +38,7 @@ from selfcal_ros.estimation.joint.noise_effects import (
     axis_contrast,
     axis_variances,
     correlated_variances,
+    plate_variances,
     time_correlation,
 )
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
@@ -357,12 +358,17 @@ def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> Artifact
         if model.equations is not None:
             columns, lines = model.equations.columns.grid, model.equations.columns.lines
         if all(isinstance(pose, LatticePose) for pose in problem.grid.poses):
-            variance = plate_covariance(cover, options.reference, columns=columns,
-                                        half_width_m=length, sigma_m=sigma).diagonal()
+            of_plate = plate_covariance(cover, options.reference, columns=columns,
+                                        half_width_m=length, sigma_m=sigma)
+            variance = np.stack(of_plate.diagonal())
+            images = problem.images
+            if images is not None and system.grid.n_sites <= MAX_SITES:
+                variance = variance + images.noises(found.residuals).share * plate_variances(
+                    model, of_plate, images.added)
         else:
             both = BothCovariance(system, found.inverse, options.reference, half_width_m=length,
                                   sigma_m=sigma)
-            variance = both.placed_diagonal(plates_of_terms(cover, columns), cover.terms)
+            variance = np.stack(both.placed_diagonal(plates_of_terms(cover, columns), cover.terms))
         u_x, u_y = (np.where(system.known_marks, np.sqrt(v) * sigma_m, np.nan) for v in variance)
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
             u_theta = np.sqrt(angular_plate_variance(

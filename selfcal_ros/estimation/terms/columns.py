@@ -281,8 +281,12 @@ def _shared_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) ->
     """Add the columns of a term of the visits whose coefficients all views share."""
     both = [None if visits is None else _values(ground, term.name, visits) * visits.phase
             for visits in ground.visits]
-    means = [None if visits is None or values is None else visits.means(values, ground.z.size)
-             for visits, values in zip(ground.visits, both, strict=True)]
+    # in the nominal frame, as the map: an approach that every visit of a site has is the map's
+    frames = [visits.frame if visits is not None and term.name is TermName.APPROACH else 1.0
+              for visits in ground.visits]
+    means = [None if visits is None or values is None
+             else visits.means(values / frame, ground.z.size)
+             for visits, values, frame in zip(ground.visits, both, frames, strict=True)]
     for row, parts in enumerate(_SHARED[term.name]):
         number = made.add(
             {view: mean[row] for view, mean in enumerate(means) if mean is not None},

@@ -43,6 +43,8 @@ class ViewVisits:
         Sign of the last motion of each stage axis; 0 = unknown.
     phase : complex
         i^-q: from the stage frame to the plate frame.
+    frame : complex
+        Part of it that turns the nominal plate frame to that of the plate as it lies.
     """
 
     mark: np.ndarray
@@ -53,6 +55,7 @@ class ViewVisits:
     approach_x: np.ndarray
     approach_y: np.ndarray
     phase: complex
+    frame: complex = 1.0
 
     def means(self, values: np.ndarray, n_marks: int) -> np.ndarray:
         """Return the weighted mean of complex values (k, V) at each mark, (k, marks)."""

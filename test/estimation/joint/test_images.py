@@ -10,10 +10,12 @@ from scipy.stats import binom
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.images import image_noise
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
@@ -97,6 +99,16 @@ def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     np.testing.assert_allclose(found.u_gy, u[1::2].reshape(shape), rtol=1e-5)
     alone = np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T))
     assert u.mean() > 1.8 * alone.mean()
+    # the plate has the scale of stage and plate together: noise of images moves it little
+    artifact = measurements.artifact
+    z = np.stack([artifact.m.ravel(), artifact.n.ravel()], axis=1).ravel().astype(float)
+    both = inverse[2 * sites:4 * sites] + np.outer(z, z @ inverse[:2 * sites]) / (z @ z)
+    kept = np.eye(2 * sites) - datum(artifact) - np.outer(z, z) / (z @ z)
+    gain = both - kept @ both
+    u = np.sqrt(np.diag(gain @ covariance @ gain.T))
+    np.testing.assert_allclose(result.artifact_map.u_ax, u[::2].reshape(shape), rtol=1e-5)
+    np.testing.assert_allclose(result.artifact_map.u_ay, u[1::2].reshape(shape), rtol=1e-5)
+    assert u.mean() < 0.9 * np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T)).mean()
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.06])
@@ -166,6 +178,28 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
         assert camera["rotation"] == pytest.approx(0.003, abs=1e-4)
         radial = next(c["x"] for c in camera["coefficients"] if c["power"] == [2, 1])
         assert radial == pytest.approx(0.02 / 1.414e-3**2, rel=0.03)
+
+
+def test_degrees_of_freedom_are_those_of_the_maps_variance():
+    power, dof = [], []
+    for seed in range(120):
+        found = solve_joint(measured(3 * MARK, seed, size=5)[1], ALONE).result
+        power.append((found.error_map.u_gx**2).mean())
+        dof.append(found.noise.dof_xy)
+    shown = 2 * np.mean(power) ** 2 / np.var(power, ddof=1)
+    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 1/1.3 and 1.3
+    assert np.mean(dof) < 100
+
+
+def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
+    """Rotations of the views let readings tell it from the stage by rounding and worse."""
+    _, measurements = measured(0.3 * MARK, 1155, size=7, **DISTORTED)
+    assert calibrate(measurements).verdict.causes == ()
+    equations = solve_joint(measurements, Options(
+        terms=(ModelTerm(TermName.APPROACH, 1e-8),))).model.equations
+    rows = equations.rows([TermName.APPROACH])
+    share = np.diag(equations.information)[rows] / equations.norm[rows] ** 2
+    assert np.abs(share).max() < 1e-14
 
 
 def test_a_camera_without_distortion_has_a_linear_error():

@@ -9,6 +9,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
@@ -191,3 +192,19 @@ def test_a_stage_that_stands_a_tenth_of_a_pitch_off_the_sites(model, sense):
     assert np.sqrt(np.mean((u / spread) ** 2)) == pytest.approx(1, abs=0.01)
     same_noise = at_sites.noise.sigma_xy / result.noise.sigma_xy
     assert np.sqrt(np.mean((u / u_other) ** 2)) * same_noise == pytest.approx(1.054, abs=0.01)
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_an_approach_turns_with_the_frame_of_the_plate(sense):
+    """Of 2 um, with plates rotated by 2 degrees: 70 nm if it did not."""
+    plan = PLANS["no lines"]
+    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(3), Spread(
+        phi_rad=0.035, backlash_x_m=2e-6, backlash_y_m=-1e-6))
+    found = solve_joint(simulate_measurements(
+        truth, plan, np.random.default_rng(4), settings=CellSettings(sense, servo_sigma_m=0.0)),
+        Options(terms=parse_terms(["approach"], ""), assumed=(), at_places=False)).result
+    (term,) = found.model.terms
+    values = {estimate.component: estimate.value for estimate in term.estimates}
+    assert values == pytest.approx({"x": 2e-6, "y": -1e-6}, rel=1e-4)
+    g = np.stack([found.error_map.gx, found.error_map.gy])
+    np.testing.assert_allclose(g, truth.g, atol=1e-10)
