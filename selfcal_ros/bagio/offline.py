@@ -20,7 +20,13 @@ from selfcal_ros.files import add_file, read_json
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    IMAGE_TOPICS,
+    INPUT_TOPICS,
+)
 
 FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
                    DETECTION_TOPIC: ("detection", Reason.FUTURE),
@@ -222,6 +228,7 @@ class Playlist:
         numbers, counts = np.unique(np.array(topics, dtype=np.uint8), return_counts=True)
         self.counts = {TOPICS[number]: int(count)
                        for number, count in zip(numbers, counts, strict=True)}
+        self._note_images(reader)
         sorted_already = bool((self._times[1:] >= self._times[:-1]).all())
         order = None if sorted_already else np.argsort(self._times, kind="stable")
         self._times = self._times if order is None else self._times[order]
@@ -229,6 +236,16 @@ class Playlist:
             mixed = np.random.default_rng(seed).permutation(len(self))
             order = mixed if order is None else order[mixed]
         self._order = order
+
+    def _note_images(self, reader: BagReader) -> None:
+        """Tell of images, which are not played; refuse a bag with nothing else to show marks."""
+        images = [topic for topic in reader.topics
+                  if f"/{topic}".endswith(tuple(f"/{role}" for role in IMAGE_TOPICS.values()))]
+        what, remedy = f"images on {', '.join(images)} are not played", (
+            f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them")
+        if images and DETECTION_TOPIC not in self.counts:
+            raise InputError(str(self._bag), f"{what}, and there are no detections", remedy)
+        self.lost += [f"{what}: {remedy}"] if images else []
 
     def _reader(self) -> BagReader:
         return BagReader(self._bag, self._namespace, leave_ahead=self._leave_ahead)

@@ -111,11 +111,11 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
         1 for marks brighter than the ground, -1 for darker ones, 0 for both.
     """
     factor = max(1, int(size / REDUCED_SIZE))
+    half = _half(size / factor)
+    if min(image.shape) // factor <= half:
+        return []
     small = reduced(image, factor)
     small -= small.mean()
-    half = _half(size / factor)
-    if min(small.shape) <= half:
-        return []
     padded = _reflected(small, half)
     templates = _templates(mark, size / factor, width / factor, padded.shape, sign)
     best = _correlated(padded, templates, sign)[

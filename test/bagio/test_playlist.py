@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is played, and in which order: by time of logging, equal times as in the file."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import EncoderSample
+from selfcal_ros.errors import InputError
+from selfcal_ros.messages import from_model
+from selfcal_ros.simulation.bag import event_fields
+from selfcal_ros.topics import IMAGE_TYPES, INPUT_TOPICS
 from test.support import bags
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan
@@ -75,3 +83,26 @@ def test_one_cell_of_two_is_played(tmp_path, events):
 def test_nothing_to_play(tmp_path):
     playlist = Playlist(Foreign().write(tmp_path / "x.mcap", []))
     assert len(playlist) == 0 and playlist.counts == {} and list(playlist) == []
+
+
+def test_a_bag_that_shows_marks_in_images_only_is_refused():
+    bag = Path(__file__).parents[2] / "bags/camera"
+    with pytest.raises(InputError, match="images on /stage/image are not played, and there are no "
+                       r"detections; selfcal detect .*bags/camera -o FOUND_BAG"):
+        Playlist(bag)
+
+
+def test_images_beside_detections_are_said_not_to_be_played(tmp_path, events):
+    with BagWriter(tmp_path / "bag") as writer:
+        for event in events:
+            topic, fields = event_fields(event, "stage")
+            if topic not in writer.counts:
+                writer.add_topic(topic, INPUT_TOPICS[topic], [])
+            writer.write(topic, fields, event.stamp_ns)
+        writer.add_topic("/stage/image", IMAGE_TYPES["raw"], [])
+        writer.write("/stage/image", from_model.image(
+            np.zeros((2, 2), np.uint8), "mono8", 10**9, "camera"), 10**9)
+    playlist = Playlist(tmp_path / "bag")
+    assert len(playlist) == len(events)
+    [line] = playlist.lost
+    assert line.startswith("images on /stage/image are not played: selfcal detect ")

@@ -173,6 +173,7 @@ def test_the_full_scale_of_a_camera_of_12_bits_can_be_given():
 def test_nothing_is_found_where_there_is_nothing():
     rng = np.random.default_rng(1)
     for values in (np.zeros((100, 120), np.uint8), np.full((9, 9), 255, np.uint8),
+                   np.zeros((1, 1), np.uint8), np.zeros((2, 4000), np.uint16),
                    rng.integers(90, 110, (200, 200)).astype(np.uint8)):
         assert detector().marks(picture(values)) == ([], {})
 
