@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened, yaw_of
@@ -52,6 +53,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     """
     check_wiring(measurements)
     options = options or Options()
+    _check_images(measurements, options)
     if options.plate is not None:
         return recheck(measurements, options, known_plate(options.plate, options.plate_from))
     camera, measurements = _camera(measurements, options)
@@ -64,6 +66,19 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     shown = {} if camera is None else camera.to_dict()
     shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
     return replace(result, extra={**result.extra, "camera": shown}) if shown else result
+
+
+def _check_images(measurements: Measurements, options: Options) -> None:
+    """Refuse images of several marks where their common noise would be missing in U."""
+    if not any(view.view.cell for view in measurements.views):
+        return
+    if options.plate is not None:
+        raise InputError(f"plan '{measurements.plan_id}'", "images of several marks do not serve "
+                         "for a recheck: U would not hold the noise that they share",
+                         "recheck with one mark an image, or calibrate anew")
+    if options.method == "law":
+        raise InputError("method law", "Hu's law has no place for images of several marks",
+                         "solve with --method joint")
 
 
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:

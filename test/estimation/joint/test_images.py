@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
@@ -220,3 +221,12 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
     found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=MARK))
     assert set(found.extra["camera"]) == {"yaw"}
     assert found.observability.identifiable
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"method": "law"}, "Hu's law has no place for images of several marks; solve with --method"),
+    ({"plate": object()}, "images of several marks do not serve for a recheck")])
+def test_what_images_do_not_serve_for_is_refused(options, said):
+    _, measurements = measured(MARK, 1, size=5)
+    with pytest.raises(InputError, match=said):
+        calibrate(measurements, Options(**options))
