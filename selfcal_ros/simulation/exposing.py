@@ -8,6 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from selfcal_ros.collection.inputs import Command, Detection, Kind
+from selfcal_ros.errors import InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import Event
@@ -41,6 +42,9 @@ def exposures(truth: Truth, plan: Plan, camera: Camera,
     The detected marks are at their offsets; the others lie around the first one as on the plate,
     seen through the same microscope.
     """
+    if truth.artifact.marks:
+        raise InputError("camera", "images are rendered of lattices, the plate is a list of marks",
+                         "simulate detections instead")
     (hx, hy), reach = truth.artifact.half, camera.reach_m
     m, n = (side.ravel() for side in np.mgrid[-hx:hx + 1, -hy:hy + 1])
     place, index, angle = np.zeros((2, 0)), -1, 0.0
