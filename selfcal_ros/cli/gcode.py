@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         wanted(result.error_map, Wiring(frame)), tolerance_m=args.tolerance * M_PER_UM,
         step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
     made = corrected_program(read_text(args.program), args.program, rewriter)
-    program = commented(made.text, "; ".join(origin_lines(result, command(args))))
+    program = commented(made.text, origin_lines(result, command(args)))
     if args.output == STDOUT:
         say(args, program.removesuffix("\n"), {"program": program})
     else:

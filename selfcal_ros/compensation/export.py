@@ -105,7 +105,8 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
 def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:
     """Return the command of an export, and file and digest of its result."""
     return [*([f"command: {command}"] if command else []),
-            *(["result: {}; sha256: {}".format(*result.read_from)] if result.read_from else [])]
+            *([f"result: {result.read_from[0]}", f"sha256 of the result: {result.read_from[1]}"]
+              if result.read_from else [])]
 
 
 def _uncertainty_line(result: CalibrationResult) -> str:

@@ -8,6 +8,7 @@ the program does not show is refused.
 
 import math
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,8 @@ AT_END = {"0", "1", "2", "30", "60"}
 OF_SAMPLES = 1 / 8
 """Part of the chord tolerance for the distance of the points on which the path is judged."""
 MAX_SAMPLES = 1_000_000
+LONGEST = 200
+"""Characters of a comment: LinuxCNC refuses lines of 256."""
 
 
 class Word(NamedTuple):
@@ -73,16 +76,18 @@ def corrected_program(text: str, where: str, rewriter: "Rewriter") -> Corrected:
     return Corrected("".join(out), rewriter.moves, rewriter.pieces)
 
 
-def commented(program: str, comment: str) -> str:
-    """Return a program with a comment as its first line, after a % and the program's number.
+def commented(program: str, comments: Sequence[str]) -> str:
+    """Return a program with comments as its first lines, after a % and the program's number.
 
     Between parentheses if the program has such comments, as not all controllers know both forms.
     """
-    plain = re.sub(r"[^ -~]|[()]", "_", comment)
-    text = f"({plain})" if "(" in re.sub(";.*", "", program) else f"; {plain}"
+    form = "({})" if "(" in re.sub(";.*", "", program) else "; {}"
+    newline = "\r\n" if "\r\n" in program else "\n"
+    text = "".join(form.format(re.sub(r"[^ -~]|[()]", "_", line[:LONGEST])) + newline
+                   for line in comments)
     head = re.match(r"(?:\s*%[^\n]*\n)?(?:[ \t]*O\d[^\n]*\n)?", program, re.I | re.ASCII)
     at = head.end() if head else 0
-    return program[:at] + text + ("\r\n" if "\r\n" in program else "\n") + program[at:]
+    return program[:at] + text + program[at:]
 
 
 class Rewriter:

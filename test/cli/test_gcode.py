@@ -32,7 +32,7 @@ def run(line: str) -> int:
 def test_points_are_commanded_with_the_error_added(capsys):
     assert run("in.nc R.json -o out.nc --decimals 6") == 0
     assert capsys.readouterr().out == "written: out.nc, 2 moves as 2\n"
-    form = r"; command: selfcal gcode in.nc .*; sha256: \w{64}\n" \
+    form = r"; command: selfcal .*\n; result: R.json\n; sha256 of the result: \w{64}\n" \
         r"G0 X(\S+) Y(\S+) ; begin\nG1 X(\S+) Y(\S+) F100\n"
     found = map(float, re.fullmatch(form, Path("out.nc").read_text()).groups())
     assert list(found) == pytest.approx([
@@ -44,7 +44,7 @@ def test_points_are_commanded_with_the_error_added(capsys):
     ("--home-x -10 --home-y 20", (1, 4), 1), ("--reverse-x --home-x 10", (3, 2), -1)])
 def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys):
     assert run(f"in.nc R.json -o - --decimals 6 {options}") == 0
-    first = capsys.readouterr().out.splitlines()[1].split()
+    first = capsys.readouterr().out.splitlines()[3].split()
     assert float(first[1][1:]) == pytest.approx(sign * 1e3 * MAP.gx[site], abs=6e-7)
     assert float(first[2][1:]) == pytest.approx(1e3 * MAP.gy[site], abs=6e-7)
 
@@ -52,7 +52,7 @@ def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys
 def test_inches_without_a_word_for_them_are_told(capsys):
     Path("in.nc").write_text("G0 X0.3937007874 Y0\n")
     assert run("in.nc R.json -o - --unit in --json --decimals 7") == 0
-    word = json.loads(capsys.readouterr().out)["program"].splitlines()[1].split()[1]
+    word = json.loads(capsys.readouterr().out)["program"].splitlines()[3].split()[1]
     assert float(word[1:]) * 0.0254 == pytest.approx(0.01 + MAP.gx[3, 2], abs=1e-10)
 
 

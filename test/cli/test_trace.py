@@ -86,7 +86,15 @@ def test_the_comment_of_a_program_follows_its_number(here):
     assert main(EXPORTS["g.nc"].split()) == 0
     first, second, third, *_ = Path("g.nc").read_text().splitlines()
     assert (first, second) == ("%", "O1234")
-    assert third.startswith("(command: selfcal gcode in.nc r.json") and third.endswith(")")
+    assert third == "(command: selfcal gcode in.nc r.json -o g.nc)"
+
+
+def test_comments_of_a_program_fit_into_the_lines_of_linuxcnc(here):
+    long = here / ("x" * 120) / ("y" * 120) / "é.json"
+    long.parent.mkdir(parents=True)
+    shutil.copy("r.json", long)
+    assert main(["gcode", "in.nc", str(long), "-o", "g.nc"]) == 0
+    assert all(len(line) < 256 and line.isascii() for line in Path("g.nc").read_text().splitlines())
 
 
 def test_a_folder_is_moved_with_its_records(here, tmp_path, capsys, monkeypatch):
