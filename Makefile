@@ -23,8 +23,11 @@ build/linters/.clean: build/linters/.complete setup.cfg $(shell find $(LINTED) -
 ament-lint: build/linters/.clean  # what ament_flake8 and ament_pep257 check, with setup.cfg
 # bytecode is kept: else each worker compiles all tests anew, and each process that they start the package
 # three workers on two cores: as a rule one waits for a message
-test: lint ament-lint
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist worksteal
+build/oracles/.complete: tools/oracle-requirements.txt | setup
+	@mkdir -p build/oracles; $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes \
+		--upgrade --target build/oracles -r $< && touch $@ || echo "test: GTC is left out: it cannot be installed"
+test: lint ament-lint build/oracles/.complete
+	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \
 		echo "test-oldest: apt install pkg-config libfreetype-dev libqhull-dev" >&2; exit 2; }

@@ -196,7 +196,22 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as strict JSON (no NaN) to `path` atomically."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+    write_text(path, json_text(value) + "\n")
+
+
+def json_text(value: Any, depth: int = 0) -> str:
+    """Return strict JSON (no NaN), a key or row on a line: lists of numbers are not broken."""
+    inner, ends = [], "[]"
+    if isinstance(value, dict):
+        ends, inner = "{}", [f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
+                             for key, item in value.items()]
+    elif isinstance(value, list | tuple) and any(
+            isinstance(item, dict | list | tuple) for item in value):
+        inner = [json_text(item, depth + 1) for item in value]
+    if not inner:
+        return json.dumps(value, allow_nan=False)
+    line = "\n" + " " * depth
+    return f"{ends[0]}{line} {f',{line} '.join(inner)}{line}{ends[1]}"
 
 
 def write_yaml(path: str | os.PathLike, value: Any) -> None:

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros import files
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import (
     check_outputs,
+    json_text,
     read_bytes,
     read_json,
     read_text,
@@ -453,3 +454,18 @@ def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(t
         files.read_json(path)
     assert str(caught.value) == (f"{path}: not usable JSON (a whole number beyond 64 bits); give a "
                                  "file that `selfcal` wrote")
+
+
+@settings(max_examples=200)
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False,
+       allow_infinity=False) | st.text(), lambda inner: st.lists(inner) | st.dictionaries(
+           st.text(), inner), max_leaves=20))
+def test_json_is_read_back_whatever_its_lines(value):
+    assert json.loads(json_text(value)) == value
+
+
+def test_a_row_of_numbers_is_a_line():
+    assert json_text({"a": [[1.5, None], []], "b": {}, "c": [{"d": 1}]}) == (
+        '{\n "a": [\n  [1.5, null],\n  []\n ],\n "b": {},\n "c": [\n  {\n   "d": 1\n  }\n ]\n}')
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        json_text({"a": [float("nan")]})

@@ -3,7 +3,6 @@
 
 import argparse
 import contextlib
-import json
 import sys
 import threading
 import time
@@ -41,7 +40,9 @@ def tell(text: str) -> None:
 
 def put(data: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
-    print(json.dumps(data, indent=1, allow_nan=False))
+    from selfcal_ros.files import json_text
+
+    print(json_text(data))
 
 
 def file_of(args: argparse.Namespace) -> str | None:

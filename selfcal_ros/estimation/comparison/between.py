@@ -19,6 +19,8 @@ INDEPENDENT = 1e-6
 """Length of a unit shape outside of those before it, below which it is not one of its own."""
 RUNS_LEVEL = 0.05
 """Probability that a run stands out, or a part between runs seems to exist, by chance."""
+SINGLE = 0.8
+"""Part of the scatter between runs above which a single shape is nearly all of it."""
 TINY = np.finfo(float).tiny
 
 
@@ -90,7 +92,8 @@ class Mean:
     weights : float array (runs,)
         Weights, sum 1.
     dof : float
-        Degrees of freedom of u, the median of all values.
+        Degrees of freedom of u, the median of all values; the fewest if nearly all that runs
+        differ by is the amplitude of a single shape.
     deviations : tuple of Deviation
         Of each run.
     """
@@ -244,10 +247,12 @@ def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
         np.eye(len(q)) - q @ q.T - shapes @ shapes.T)
     covariance = covariance + pooled.sum() * added
     whole = within + (weights @ shares) ** 2 * _diagonal(common) + between
+    p = _p_between(parts, runs, own)
+    single = p < RUNS_LEVEL and of_shapes.max(initial=0.0) > SINGLE * spread.sum()
     return Mean(
         weights @ values, covariance, within, (weights @ shares) ** 2 * _diagonal(common), between,
-        float(np.sqrt(spread.mean())), _p_between(parts, runs, own), weights,
-        _dof(runs, own, parts, (of_shapes, of_rest), weights, whole),
+        float(np.sqrt(spread.mean())), p, weights,
+        _dof(runs, own, parts, (of_shapes, of_rest), weights, whole, fewest=single),
         tuple(_deviation(i, runs, values, own, common, weights, q, added)
               for i in range(len(runs))))
 
@@ -286,8 +291,9 @@ def _noise_dof(runs: list[Run], own: list[np.ndarray], factors: np.ndarray) -> f
 
 
 def _dof(runs: list[Run], own: list[np.ndarray], parts: _Parts,
-         between: tuple[np.ndarray, float], weights: np.ndarray, whole: np.ndarray) -> float:
-    """Return the degrees of freedom of the mean's u: the median of all values.
+         between: tuple[np.ndarray, float], weights: np.ndarray, whole: np.ndarray, *,
+         fewest: bool) -> float:
+    """Return the degrees of freedom of the mean's u: the median of all values, or the `fewest`.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
     which contains the part within runs, with one degree of freedom less than there are runs.
@@ -304,7 +310,8 @@ def _dof(runs: list[Run], own: list[np.ndarray], parts: _Parts,
         if 0 < run.dof < MANY_DOF:
             terms = terms + (w**2 * _diagonal(c)) ** 2 / run.dof
     found = (whole**2 / np.maximum(terms, TINY))[whole > 0]
-    return min(float(np.median(found)), MANY_DOF) if len(found) else MANY_DOF
+    return min(float(found.min() if fewest else np.median(found)), MANY_DOF) if len(
+        found) else MANY_DOF
 
 
 def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray],

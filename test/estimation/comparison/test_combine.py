@@ -111,8 +111,15 @@ def test_what_is_shared_is_known_and_adds_degrees_of_freedom():
     alone, shared = (mean_of([run_of(amplitude * shape[:, 0], 0.01, common=common)
                               for amplitude in (-1.0, 0.0, 1.0)], np.zeros((4, 0)), shape)
                      for common in (0.0, 7.0))
-    ratio = np.median(shared.u**4 / (alone.within + alone.between)**2 * alone.dof)
+    ratio = np.min(shared.u**4 / (alone.within + alone.between)**2 * alone.dof)
     assert shared.dof == pytest.approx(ratio, rel=0.02) and shared.dof > 10 * alone.dof
+
+
+def test_a_single_number_that_differs_between_two_runs_has_one_degree_of_freedom():
+    """At the nodes that it moves: half of them it leaves alone, and the median would be large."""
+    shape = np.array([[1.0], [0.0], [0.0], [-1.0]])
+    single = mean_of([run_of(a * shape[:, 0], 0.01) for a in (-1.0, 1.0)], np.zeros((4, 0)), shape)
+    assert single.dof == pytest.approx(1.0, rel=0.05)
 
 
 def test_the_datum_of_a_run_changes_nothing():
