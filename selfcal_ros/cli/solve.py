@@ -67,6 +67,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "and shear (default: 0.01:0.01:0.002)")
     parser.add_argument("--drift-degree", type=int, metavar="D",
                         help="degree of a drift's polynomial (default: 3)")
+    parser.add_argument("--prior", choices=("none", "gp"),
+                        help="gp: take the stage's error for a smooth random field whose size and "
+                        "length the readings show; refused where they contradict it (default: "
+                        "none)")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
     parser.add_argument("--robust", action="store_true",
@@ -93,7 +97,7 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
     solver = node_settings(
         args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
         misalignment_model=args.misalignment, uncertainty=args.uncertainty,
-        model_terms=_model(args), drift_degree=args.drift_degree,
+        model_terms=_model(args), drift_degree=args.drift_degree, prior=args.prior,
         reference_certificate=args.certificate, reference_at=args.reference_at,
         **_reference(args.reference))
     for option in ("certificate", "reference_at"):
@@ -238,7 +242,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
         from selfcal_ros.reporting.words.tables import validation_json, validation_text
 
         used = clean(measurements, options).measurements if args.robust else measurements
-        found = validate(used, options)
+        found = validate(used, replace(options, prior=""))
         result = judged_by(result, found)
         result = replace(result, extra={
             **result.extra, "validation": validation_json(found, result.plate)})

@@ -55,6 +55,9 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     options = options or Options()
     _check_images(measurements, options)
     if options.plate is not None:
+        if options.prior:
+            raise InputError("prior", f"the plate is known from {options.plate_from}",
+                             "solve without a prior")
         return recheck(measurements, options, known_plate(options.plate, options.plate_from))
     camera, measurements = _camera(measurements, options)
     options = options if camera is None else _knowing(camera, options)
@@ -65,7 +68,13 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     yaw = None if solved.model is None else yaw_of(solved.model, measurements.sense)
     shown = {} if camera is None else camera.to_dict()
     shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
-    return replace(result, extra={**result.extra, "camera": shown}) if shown else result
+    result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
+    if not options.prior:
+        return result
+    from selfcal_ros.estimation.comparison.covariance import xy_covariance  # rarely wanted
+    from selfcal_ros.estimation.comparison.prior import with_prior  # likewise
+
+    return with_prior(result, xy_covariance)
 
 
 def _check_images(measurements: Measurements, options: Options) -> None:

@@ -26,6 +26,8 @@ from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, P
 SCHEMA = "selfcal.result/1"
 COMBINED = "combined"
 """Method of a mean of several results, and key of the runs behind it."""
+PRIOR = "prior"
+"""Key of the prior of a map: kind, size, length, and the map of the readings alone."""
 LARGEST = 1e3
 """Larger errors and uncertainties, in m or rad, are invalid: sums of their squares overflow."""
 

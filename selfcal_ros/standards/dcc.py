@@ -14,7 +14,7 @@ from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.json_form import reference_name
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import PRIOR, CalibrationResult
 from selfcal_ros.reporting.chapters import convention_section
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import dof_text, excluded_text, quantity_text
@@ -60,6 +60,9 @@ def certificate(result: CalibrationResult, details: dict[str, Any], *, covarianc
         raise InputError("certificate", "the result is not qualified: "
                          f"{printable(result.verdict.sentence)}",
                          "calibrate again, or let the certificate state it with --not-qualified")
+    if PRIOR in result.extra:
+        raise InputError("certificate", "a prior is part of the map: its uncertainty is not that "
+                         "of readings alone", "solve without a prior")
     for prefix, uri in (("dcc", DCC), ("si", SI)):
         ET.register_namespace(prefix, uri)
     root = _dcc("digitalCalibrationCertificate", _administration(result, details),

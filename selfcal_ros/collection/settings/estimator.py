@@ -129,7 +129,8 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    terms=terms, terms_from=origin if terms else "", assumed=assumed,
                    drift_degree=settings.drift_degree, plate_from=plate_from,
                    plate=calibration_of(plate_from) if plate_from else None,
-                   magnification_limit=settings.magnification_limit)
+                   magnification_limit=settings.magnification_limit,
+                   prior="" if settings.prior == "none" else settings.prior)
 
 
 def _reference(settings: SolverSettings,

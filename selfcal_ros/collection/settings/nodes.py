@@ -154,12 +154,12 @@ class SolverSettings(ManagedSettings):
     shear_u: float = declared(
         0.002, "standard uncertainty of half the difference of the microscope's scales, and of "
         "half its error of squareness, likewise", "m/m", 0.0, 1.0)
-    magnification_limit: float = declared(
-        1e-4, "difference of the scales of plate and encoders above which there is a warning",
-        "m/m", 0.0, 1.0)
-    drift_degree: int = declared(
-        DRIFT_DEGREE, "degree of the polynomial of time for the drift of a view, if drift is a "
-        "term", "", 1, MAX_DRIFT_DEGREE)
+    magnification_limit: float = declared(1e-4, "difference of the scales of plate and encoders "
+                                          "above which there is a warning", "m/m", 0.0, 1.0)
+    drift_degree: int = declared(DRIFT_DEGREE, "degree of the polynomial of time for the drift of "
+                                 "a view, if drift is a term", "", 1, MAX_DRIFT_DEGREE)
+    prior: str = declared("none", "prior of the stage's map: gp = its error is smooth, of a size "
+                          "and correlation length that the readings show", choices=("none", "gp"))
     save_path: str = declared("", "RESULT.json to write whenever the map changes; {run_id} in it "
                               "is replaced by the run; empty = none")
     result_folder: str = declared(

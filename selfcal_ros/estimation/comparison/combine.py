@@ -28,6 +28,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.result import (
     COMBINED,
+    PRIOR,
     ArtifactMap,
     CalibrationResult,
     Noise,
@@ -133,6 +134,9 @@ def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
         result = part.result
         if result is None or not result.verdict.qualified:
             raise InputError(part.name, "its calibration is not qualified", "leave it out")
+        if PRIOR in result.extra:
+            raise InputError(part.name, "a prior is part of its map, the same in every run",
+                             "solve it without a prior")
         if result.method == COMBINED:
             raise InputError(part.name, "a mean of several runs", "name these runs themselves")
         if digests[index] and digests[index] in digests[:index]:

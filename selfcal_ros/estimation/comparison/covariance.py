@@ -12,9 +12,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -23,7 +25,7 @@ from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import PRIOR, CalibrationResult
 from selfcal_ros.model.view import View
 
 MAX_LINES = 1024
@@ -38,6 +40,8 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
 
     (2n, 2n), or the variances (2n,) if the correlations are unknown.
     """
+    if PRIOR in result.extra:
+        return after_prior(result, known, xy_covariance), True
     emap = result.error_map
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
     if "xy" in (stored := result.extra.get(COVARIANCE, {})):
@@ -128,6 +132,13 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
+    if PRIOR in result.extra:
+        known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
+        z = (result.artifact.m + 1j * result.artifact.n).astype(complex)
+        shear = Gauge(z, known, scale=True).shear[:, known]
+        rows = np.concatenate([shear.real, shear.imag], axis=1)
+        u = np.sqrt(np.diag(rows @ xy_covariance(result, known)[0] @ rows.T)) / pitch_m
+        return float(u[0]), float(u[1])
     system = system_behind(result)
     if system is None or _lacks_terms(result):
         return float("nan"), float("nan")

@@ -20,6 +20,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     tells_what_was_read,
     unit_rows,
 )
+from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.both import BothCovariance
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
@@ -170,6 +171,7 @@ class Together:
 
 def together(result: CalibrationResult) -> Together | None:
     """Return what a result knows of stage and plate together; None if that is not all kept."""
+    result = measured_alone(result)
     if result.method != "joint" or not tells_what_was_read(result):
         return None
     kept = result.extra.get(KEY, {})

@@ -18,6 +18,7 @@ from selfcal_ros.estimation.comparison.maps import (
     Significance,
     significance,
 )
+from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.comparison.together import Together, together
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.placed import MapSpline
@@ -88,6 +89,7 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(where, "its readings contradict the model: its plate is not known",
                          "calibrate anew")
+    result = measured_alone(result)
     kept = together(result)
     if kept is None:
         raise InputError(where, "the covariance of its plate is not kept",

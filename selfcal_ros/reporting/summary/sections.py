@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.result import PRIOR, CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.summary.camera import camera_facts
@@ -338,9 +338,9 @@ def state_sentence(result: CalibrationResult) -> str:
 
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
-    share = "" if figures.n_known == figures.n_sites else (
-        f" at {figures.n_known} of {figures.n_sites} sites")
-    text = f"Calibrated{share} from {counted(views_done(result), 'view')}"
+    share = f" at {figures.n_known} of {figures.n_sites} sites"
+    text = f"Calibrated{share * (figures.n_known < figures.n_sites)} from " + counted(
+        views_done(result), "view") + (" with a prior" if PRIOR in result.extra else "")
     if not figures.n_known:
         return text
     k = result.noise.k_xy

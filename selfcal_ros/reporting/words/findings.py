@@ -203,6 +203,11 @@ SENTENCES: dict[str, Words] = {
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
         "marks there and back, along x and along y"),
+    "prior": lambda f, of: (
+        "the map has a prior: its error beyond first order is taken for a smooth random field of "
+        f"{f.size * UM_PER_M:.3g} µm and a correlation length of {of['length_m'] * MM_PER_M:.3g} "
+        f"mm, as the readings show; by these alone u would be {of['u_rms_without'] * UM_PER_M:.3g} "
+        f"instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)"),
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (
         f"the plate is {_either(f, 'larger', 'smaller')} than the encoders indicate by "
