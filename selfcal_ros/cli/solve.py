@@ -169,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda count: bar(count, None))
     said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
     for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
-        print(f"selfcal solve: {args.bag}: {line}", file=sys.stderr)
+        print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
     for name in ("validate", "robust"):
         if options.plate is not None and getattr(args, name):

@@ -62,6 +62,8 @@ class Evidence:
     lies : str
         Actual pose of the plate, and remedy, if the ids of the marks show another pose than
         planned.
+    alone : bool
+        Whether no other view tells a wrong pose from wrong joints.
     """
 
     rejected: Mapping[str, int]
@@ -79,6 +81,7 @@ class Evidence:
     limit_m: float = 0.0
     sense: Sense = Sense.MICROSCOPE_MOVES
     lies: str = ""
+    alone: bool = False
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ def diagnose(evidence: Evidence) -> RejectionFinding | None:
     elif reason == Reason.OUTSIDE_VIEWS:
         cause = _command_clock(evidence)
     elif reason in PLACED:
-        cause = evidence.lies or _stage(evidence)
+        cause = "; or, if it lies as planned: ".join(filter(None, (
+            evidence.lies, _stage(evidence) if evidence.alone or not evidence.lies else None)))
     return RejectionFinding(reason, count, total, cause or REMEDY[Reason(reason)])
 
 
@@ -310,11 +314,13 @@ class DetectionsSeen:
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())
         stage, site = self._stage_and_sites(rows[-LOOKED_AT:], views)
         # if all views are affected the sense may be wrong: it looks like half a turn
-        lies = "" if whole else self._lies(rows[-LOOKED_AT:], views)
+        alone = whole and len(views) == 1
+        lies = self._lies(rows[-LOOKED_AT:], views) if alone or not whole else ""
         return diagnose(Evidence(
             rejected, used, missing, encoder.foreign, _span(table["stamp"]), encoder.span_ns,
             self.commands_ns, encoder.step_s, encoder.max_gap_s, stage, site,
-            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies))
+            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies,
+            alone))
 
     def _lies(self, rows: np.ndarray, views: Mapping[int, ViewReadings]) -> str:
         """Return the actual pose of a view's plate, if its marks match another pose."""

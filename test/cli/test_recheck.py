@@ -57,7 +57,7 @@ def test_a_stage_that_has_changed(folder, capsys):
     assert main(["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out),
                  "--report", str(folder / "bent.html")]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("Changed since r.json: calibrate anew; most at x = ")
+    assert text.startswith("Changed since r.json: calibrate anew, if it is the same ")
     data = read_json(out)
     assert data["recheck"]["changed"] is True and data["recheck"]["p"] < 1e-3
     assert data["warnings"][0].startswith("Changed since r.json")

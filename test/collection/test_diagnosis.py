@@ -68,9 +68,17 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
 def test_the_other_sense(sense):
     other = next(s for s in Sense if s is not sense)
     assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {None: (
-        "24 of 25 detections were rejected as stage_not_at_mark: the stage is indicated at minus "
-        f"the marks' sites; the sense is the other one: measurement_sense {sense} "
-        f"(--sense {sense})")}
+        "24 of 25 detections were rejected as stage_not_at_mark: the plate lies turned by 180°, "
+        "not by 0°; turn it as planned and measure this view again, or correct its pose in the "
+        "plan; or, if it lies as planned: the stage is indicated at minus the marks' sites; the "
+        f"sense is the other one: measurement_sense {sense} (--sense {sense})")}
+
+
+def test_the_only_view_asks_for_the_pose_before_the_joints():
+    """A plate at 90 degrees looks like exchanged joints of which one has the wrong sign."""
+    text = findings(with_positions(scene(count=0), lambda x, y: (-y, x)))[None]
+    assert text.index("the plate lies turned by 90°, not by 0°") < text.index(
+        "or, if it lies as planned: x and y are exchanged and y is indicated with the wrong sign")
 
 
 @pytest.mark.parametrize(("change", "text"), [

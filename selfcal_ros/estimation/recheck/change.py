@@ -283,17 +283,24 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     if artifact.shape == old.shape and abs(
             artifact.grid_pitch_m / old.grid_pitch_m - 1) < PITCH_TOLERANCE:
         return np.eye(kept.size)[:, kept.ravel()], kept, kept
-    grid = plate.result.plate.map_grid
+    rows, kept, inside = rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
+    return rows, kept, inside.reshape(artifact.shape)
+
+
+def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows from known nodes of the old map to places, complex (P,), m.
+
+    Rows (P, s), the nodes used, bool (ox, oy), and the places where it is known, bool (P,).
+    """
+    kept, old, grid = plate.kept.sites, plate.result.artifact, plate.result.plate.map_grid
     how = Interpolation.BICUBIC if grid is None else grid.interpolation
-    spline = MapSpline.of(old, how if kept.all() else Interpolation.BILINEAR)
-    places = (artifact.x_m + 1j * artifact.y_m).ravel()
-    n = kept.size
+    spline, n = MapSpline.of(old, how if kept.all() else Interpolation.BILINEAR), kept.size
     unit = spline.coefficients(np.eye(n).reshape(n, *kept.shape)).reshape(n, n).T
     rows = spline.rows(places) @ unit
     inside = np.abs(rows[:, ~kept.ravel()]).sum(axis=1) < EDGE
     reach = (np.array(old.half) + EDGE) * old.grid_pitch_m
     inside &= (np.abs(places.real) <= reach[0]) & (np.abs(places.imag) <= reach[1])
-    return rows[:, kept.ravel()], kept, inside.reshape(artifact.shape)
+    return rows[:, kept.ravel()], kept, inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,7 +361,8 @@ def record(change: Change, lines: Change, artifact: Artifact, of: str) -> dict[s
         "of": of, "changed": bool(p < DIFFERENCE_LEVEL), "p": p, "largest": largest,
         "rms": rms(change.values), "u_rms": rms(change.u), "p_xy": change.p,
         "significance_xy": None if change.test is None else asdict(change.test),
-        "scale": {"change": change.scale, "u": change.u_scale, "p": change.p_scale},
+        "scale": {"changed": bool(change.p_scale < DIFFERENCE_LEVEL), "change": change.scale,
+                  "u": change.u_scale, "p": change.p_scale},
         "dx": change.values[0], "dy": change.values[1], "u_dx": change.u[0], "u_dy": change.u[1]}
     if lines.test is not None:
         line = lines.worst[0]

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -37,6 +38,7 @@ from selfcal_ros.estimation.recheck.change import (
     on_plate,
     record,
 )
+from selfcal_ros.estimation.recheck.same_plate import check_plate
 from selfcal_ros.estimation.recheck.views import (
     Gain,
     PlateReadings,
@@ -129,21 +131,22 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     Raises
     ------
     NoDataError, NotIdentifiableError, InputError
-        If no known mark was read, too little is known, or the readings do not fit the plate.
+        If no known mark was read, too little is known, or the plate lies otherwise than planned
+        (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
     readings, seen, parts = solved.readings, solved.seen, solved.new.variances(plate)
     found = record(map_change(solved.new, plate), line_change(solved.lines, plate),
                    solved.new.artifact, plate.where)
     noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
-    failed, before = _misfit(seen, solved.xy.dof), plate.result.verdict
+    other = check_plate(readings.measurements, plate, solved.xy.sigma)
+    failed = (other,) if other is not None else _misfit(seen, solved.xy.dof)
+    found["passes"] = min(view.view.repeats for view in measurements.views)
+    before = plate.result.verdict
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
         _views(readings, seen), _observability(seen), noise, measurements.all_rejected(),
-        findings=(Finding("changed", found["largest"]["change"], found["largest"]["u"], "m",
-                          found["p"], axis=found["largest"]["axis"], details={
-                              "x": found["largest"]["x"], "y": found["largest"]["y"],
-                              "of": plate.where}),) * found["changed"],
+        findings=() if failed else _findings(found),
         sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=before.enlarged_by),
@@ -153,6 +156,17 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
         else None)
     return replace(result, budget=tuple(_budget(result, parts, plate)))
+
+
+def _findings(found: dict[str, Any]) -> tuple[Finding, ...]:
+    """Return what has changed: the map, and the scale that is no part of it."""
+    largest, scale, of = found["largest"], found["scale"], {"of": found["of"]}
+    where = {"x": largest["x"], "y": largest["y"], "passes": found["passes"], **of}
+    both = (Finding("changed", largest["change"], largest["u"], "m", found["p"],
+                    axis=largest["axis"], details=where),
+            Finding("scale_changed", scale["change"], scale["u"], "m/m", scale["p"], details=of))
+    return tuple(one for one, told in zip(both, (found["changed"], scale["changed"]), strict=True)
+                 if told)
 
 
 def plate_readings(measurements: Measurements, options: Options,

@@ -51,6 +51,8 @@ def line_text(line: BudgetLine) -> str:
 
 STILL_GOOD = "Still good"
 CHANGED = "Changed"
+ONE_PASS = ("one pass does not tell a change from drift: two passes do (repeats: 2, visit_order: "
+            "there_and_back)")
 
 
 def recheck_sentence(found: Mapping[str, Any]) -> str:
@@ -61,12 +63,38 @@ def recheck_sentence(found: Mapping[str, Any]) -> str:
     found : mapping
         ``recheck`` of RESULT.json.
     """
-    since = printable(os.path.basename(str(found["of"])))
+    since, scale = printable(os.path.basename(str(found["of"]))), found.get("scale", {})
     if found["changed"]:
-        return (f"{CHANGED} since {since}: calibrate anew; {_largest(found['largest'])} "
-                f"(p = {found['p']:.2g})")
+        drift = f"; {ONE_PASS}" * (found.get("passes") == 1)
+        return (f"{CHANGED} since {since}: calibrate anew, if it is the same plate, clean and "
+                f"placed as planned; {_largest(found['largest'])} (p = {found['p']:.2g}){drift}")
+    if scale.get("changed"):
+        return (f"{_scale_changed(since, scale['change'], scale['u'], scale['p'])}; otherwise no "
+                f"change beyond its uncertainty (p = {found['p']:.2g}); "
+                f"{_largest(found['largest'])}")
     return (f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found['p']:.2g}); "
             f"{_largest(found['largest'])}")
+
+
+def _scale_changed(since: str, change: float, u: float, p: float) -> str:
+    return (f"Scale changed since {since} by {change * UM_PER_M:+.3g} ± {u * UM_PER_M:.2g} µm/m "
+            f"(k=1, p = {p:.2g}): the temperature of the plate or the encoders, one plate does not "
+            "tell which")
+
+
+def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
+    """Return the warning of encoders whose scale against the plate has changed."""
+    since = printable(os.path.basename(str(of["of"])))
+    return _scale_changed(since, found.size, found.u, found.p)
+
+
+def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
+    """Return the reason why what was read is not the plate that is known."""
+    since = printable(os.path.basename(str(of["of"])))
+    return (f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
+            f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
+            "u, each by itself, as no stage does: check which plate it is, that it is clean and "
+            "lies as planned; if it has changed, calibrate anew")
 
 
 def _largest(of: Mapping[str, Any]) -> str:
@@ -85,14 +113,17 @@ def recheck_lines(found: Mapping[str, Any]) -> list[str]:
         out.append(f"theta  most at line {line['line']}, by "
                    f"{line['change'] * ARCSEC_PER_RAD:+.4f} ± {line['u'] * ARCSEC_PER_RAD:.4f} "
                    f"arcsec (k=1), p = {found['p_theta']:.2g}")
+    if found.get("passes") == 1:
+        out.append(ONE_PASS)
     return [*out, f"scale  {scale['change'] * UM_PER_M:+.4f} ± {scale['u'] * UM_PER_M:.4f} µm/m "
             f"against the plate (k=1), p = {scale['p']:.2g}"]
 
 
 def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a stage that has changed."""
-    return recheck_sentence({"changed": True, "of": of["of"], "p": found.p, "largest": {
-        "x": of["x"], "y": of["y"], "axis": found.axis, "change": found.size, "u": found.u}})
+    largest = {"x": of["x"], "y": of["y"], "axis": found.axis, "change": found.size, "u": found.u}
+    return recheck_sentence({"changed": True, "of": of["of"], "p": found.p, "largest": largest,
+                             "passes": of.get("passes")})
 
 
 def misfit_text(found: Finding, _: Mapping[str, Any]) -> str:

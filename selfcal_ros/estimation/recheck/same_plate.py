@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether what was read is the known plate, placed as planned (method eq. 13.4).
+
+With the stage as it was, the readings of a view less both known maps leave motion, strain and
+noise. A wrong pose or another plate leaves differences of marks instead: unlike a change of the
+stage, they have nothing in common from one mark to the next.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.estimation.checks.placing import (
+    BETTER,
+    CLEARLY,
+    CONTRADICTED,
+    LEAST_READINGS,
+    Misplaced,
+    said,
+)
+from selfcal_ros.estimation.recheck.change import KnownPlate, rows_at
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.pose import EDGE
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.verdict import Finding
+
+MANY = 5.0
+"""Median difference, in standard uncertainties, beyond which most marks differ."""
+
+ALIKE = 0.3
+"""Correlation of neighbours below which differences are of marks, not of a stage."""
+
+LEAST = 0.01
+"""Part of the known errors of the marks by which those of another plate differ at least."""
+
+STEPS = 6
+"""Steps to the motion of a view by least absolute values."""
+
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a vector whose two components have the standard deviation 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """Readings of one view: marks, complex (n,), and offsets less the stage, stage frame, m."""
+
+    marks: np.ndarray
+    offsets: np.ndarray
+    turn: complex
+    shift: complex
+    u: float
+
+    def left(self, plate: np.ndarray, artifact: Artifact, pose: tuple[int, complex],
+             ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return what the known plate leaves, and of which readings; None if they are not on it.
+
+        `pose`: further quarter turns, and shift of the plate's centre, in its pitches.
+        """
+        mark = 1j ** -pose[0] * (self.marks - pose[1])
+        i, j = (np.rint(part).astype(int) + half for part, half in zip(
+            (mark.real, mark.imag), artifact.half, strict=True))
+        if ((i < 0) | (i >= artifact.shape[0]) | (j < 0) | (j >= artifact.shape[1])).any():
+            return None
+        rest = self.offsets - self.turn * 1j ** pose[0] * plate[i, j]
+        here = np.isfinite(rest)
+        if here.sum() < LEAST_READINGS:
+            return None
+        z = self.marks[here]
+        free = np.stack([np.ones(len(z)), z, z.conj()], axis=1)
+        left, weight = rest[here], np.ones((len(z), 1))
+        for _ in range(STEPS):  # least sum of lengths: single marks may be far off
+            left = rest[here] - free @ np.linalg.lstsq(
+                weight * free, weight[:, 0] * rest[here], rcond=None)[0]
+            weight = np.maximum(abs(left), self.u)[:, None] ** -0.5
+        return left, here
+
+    def poses(self) -> Iterator[tuple[int, complex]]:
+        """Yield other poses that have the marks where they are planned."""
+        t, turn = self.shift, self.turn
+        centres = [t, *(t + turn * step for step in (1, -1, 1j, -1j)), 0, -t, 1j * t, -1j * t]
+        steps = {complex(np.round(step)) for step in ((centre - t) / turn for centre in centres)
+                 if abs(step - np.round(step)) < EDGE}
+        yield from ((q, step) for step in sorted(steps, key=lambda s: (s.real, s.imag))
+                    for q in range(4) if q or step)
+
+
+def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> Finding | None:
+    """Return a finding if another plate was read, or one whose marks have changed.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Views of the plate.
+    plate : KnownPlate
+        What is known of it, and of the stage.
+    sigma : float
+        Noise of a reading, m.
+
+    Raises
+    ------
+    PlacingError
+        If the plate is not placed as planned.
+    """
+    for view in measurements.views:
+        seen = _read(view, measurements, plate, sigma)
+        planned = None if seen is None else seen.left(plate.field, measurements.artifact, (0, 0j))
+        if seen is None or planned is None:
+            continue
+        rest, here = planned
+        if (many := _size(rest) / seen.u) ** 2 < CONTRADICTED:
+            continue
+        other = _other_pose(seen, plate.field, measurements.artifact)
+        if other is not None:
+            raise said(_misplaced(view, seen, other), f"plan '{measurements.plan_id}', ")
+        if many > MANY and _neighbours(seen.marks[here], rest) < ALIKE:
+            return Finding("other_plate", _size(rest), seen.u, "m",
+                           view=view.view.name, details={"times": many, "of": plate.where})
+    return None
+
+
+def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
+          sigma: float) -> _Read | None:
+    """Return the readings of a view less the stage as it was, where it was known."""
+    artifact, pitch = measurements.artifact, measurements.artifact.grid_pitch_m
+    if not len(view.m):
+        return None
+    at, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
+    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+    rows, sites, there = rows_at(sign * at, plate)
+    stage = sign * (rows @ (old.gx + 1j * old.gy)[sites])
+    marks = plate.result.artifact_map
+    u = [sigma / np.sqrt(view.count.mean()), rms(np.stack([old.u_gx, old.u_gy])),
+         rms(np.stack([marks.u_ax, marks.u_ay])), LEAST * rms(np.stack([marks.ax, marks.ay]))]
+    offsets = np.where(there, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
+    return _Read(view.m + 1j * view.n, offsets, complex(np.exp(1j * view.view.rotation_rad)),
+                 complex(*view.view.translation_m) / pitch, float(np.linalg.norm(u)))
+
+
+def _other_pose(seen: _Read, plate: np.ndarray, artifact: Artifact) -> tuple[int, complex] | None:
+    """Return the pose that explains the readings much better than the planned one; else None.
+
+    By the gain of the log-likelihood of differences of unknown size.
+    """
+    tried = []
+    for pose in seen.poses():
+        here, planned = (seen.left(plate, artifact, each) for each in (pose, (0, 0j)))
+        if here is None or planned is None:
+            continue
+        before, after = (max(_size(rest), seen.u) for rest, _ in (planned, here))
+        tried.append((2 * len(here[0]) * float(np.log(before / after)), pose))
+    tried.sort(key=lambda item: -item[0])
+    second = tried[1][0] if len(tried) > 1 else 0.0
+    if not tried or tried[0][0] < BETTER or tried[0][0] - second < CLEARLY:
+        return None
+    return tried[0][1]
+
+
+def _size(rest: np.ndarray) -> float:
+    """Return the standard deviation of a component by the median, which few marks do not move."""
+    return float(np.median(np.abs(rest))) / RAYLEIGH_MEDIAN
+
+
+def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[int, complex]) -> Misplaced:
+    """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
+    deg, moved = np.degrees(view.view.rotation_rad), seen.shift + seen.turn * pose[1]
+    planned, found = (tuple(float(np.round(part, 6)) for part in (at.real, at.imag))
+                      for at in (seen.shift, moved))
+    return Misplaced(view.view.name, round(float(deg) % 360, 6),
+                     round(float(deg + 90 * pose[0]) % 360, 6), (planned[0], planned[1]),
+                     (found[0], found[1]))
+
+
+def _neighbours(marks: np.ndarray, rest: np.ndarray) -> float:
+    """Return the correlation of what is left at neighbouring marks."""
+    first, other = np.nonzero(np.abs(np.abs(marks[:, None] - marks) - 1) < EDGE)
+    products = (rest[first] * rest[other].conj()).real
+    return float(products.mean() / np.mean(np.abs(rest)**2)) if len(products) else 1.0
