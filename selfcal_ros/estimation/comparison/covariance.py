@@ -14,6 +14,7 @@ from scipy.optimize import nnls
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
+from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
@@ -148,11 +149,20 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
         moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
             "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
+        variance = variance + _added(result)
         variance = (variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2
     else:
         variance = _powers(result, system)[0] * np.diag(_field(system).of(system.gauge.shear))
     u = np.sqrt(variance) / length
     return float(u[0]), float(u[1])
+
+
+def _added(result: CalibrationResult) -> np.ndarray:
+    """Return what noise that is not white adds to the variances of O and R, (2,), unit noise."""
+    found = np.asarray(result.extra.get(ADDED, (0.0, 0.0)))
+    if found.shape != (2,) or found.dtype.kind not in "fi" or not np.isfinite(found).all():
+        raise InputError(ADDED, "not two variances", "write the result again with `selfcal solve`")
+    return found
 
 
 def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, float]:

@@ -19,6 +19,9 @@ from selfcal_ros.estimation.joint.noise import F_LEVEL, MIN_REPEAT_DOF, SAME
 from selfcal_ros.estimation.joint.problem import FLOOR, noise_excess
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
+ADDED = "first_order_added"
+"""Key of what such noise adds to the variances of O and R times the half width, unit noise."""
+
 MAX_SITES = 51 * 51
 """Largest field in which the axes are told apart: the time grows with the square of the sites."""
 
@@ -54,21 +57,40 @@ def axis_contrast(model: ModelFit) -> float:
     return float((squares[0] - squares[1]) / squares.sum())
 
 
-def axis_variances(model: ModelFit, cover: FieldCovariance) -> np.ndarray:
-    """Return what noise along x in place of y adds to the variances, (2, nx, ny), for unit noise.
+def structured(model: ModelFit, cover: FieldCovariance,
+               rows: np.ndarray | None = None) -> np.ndarray | float:
+    """Return what noise that is neither equal along x and y nor white adds to the variances.
+
+    Those of the nodes, or of functionals `rows` of the map, as `added_variances`.
+    """
+    added: np.ndarray | float = 0.0
+    if contrast := axis_contrast(model):
+        added = contrast * axis_variances(model, cover, rows)
+    if len(correlation := time_correlation(model)):
+        added = added + correlated_variances(model, cover, correlation, rows)
+    images = model.problem.images
+    if images is not None and (share := images.noises(model.found.residuals).share):
+        added = added + share * added_variances(model, cover, images.added, rows)
+    return added
+
+
+def axis_variances(model: ModelFit, cover: FieldCovariance,
+                   rows: np.ndarray | None = None) -> np.ndarray:
+    """Return what noise along x in place of y adds to the variances, for unit noise.
 
     The variance of a node is then that of equal noises plus `axis_contrast` times this.
     """
     turn = model.problem.to_stage[:, None, None] ** 2
     weight = model.problem.system.grid.weight
     return added_variances(model, cover, lambda rest: np.einsum(
-        "vij,kvij->k", weight, (turn * rest**2).real))
+        "vij,kvij->k", weight, (turn * rest**2).real), rows)
 
 
 def added_variances(model: ModelFit, cover: FieldCovariance,
                     of: Callable[[np.ndarray], np.ndarray],
+                    rows: np.ndarray | None = None, *,
                     columns: np.ndarray | None = None) -> np.ndarray:
-    """Return `of` the sensitivities of each coordinate of the map, (2, nx, ny).
+    """Return `of` the sensitivities of each coordinate of the map, (2, nx, ny), or of functionals.
 
     Parameters
     ----------
@@ -77,26 +99,35 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
     of : callable
         Sensitivities of k coordinates to the readings, over their weights, plate frame, complex
         (k, views, nx, ny) -> k variances for unit noise.
+    rows : complex array (k, nx, ny), optional
+        Functionals of the map, instead of its coordinates.
     columns : complex array (p, views, nx, ny), optional
         Columns of the terms in the equations of `cover`, where these are not those of the fit.
     """
     grid = cover.system.grid
     if columns is None and model.equations is not None:
         columns = model.equations.columns.grid
-    out, alone = np.zeros((2, grid.n_sites)), None
+    alone = None
     if cover.scale is not None and cover.scale.dual is not None:  # readings of marks in the scale
         total = grid.weight.sum(axis=0)
         alone = np.where(grid.read, cover.scale.dual / np.where(total > 0, total, 1), 0)
+
+    def sensitivities(rows: np.ndarray) -> np.ndarray:
+        field, parameters, terms = cover.solved(rows.T)
+        y = np.zeros(1) if columns is None else np.tensordot(terms.T, columns, axes=1)
+        rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
+        if alone is not None:
+            grown = np.real(grid.views.z_sites.ravel().conj() @ rows.T)
+            rest = rest - grown[:, None, None, None] * alone
+        return rest
+
+    if rows is not None:
+        return of(sensitivities(rows.reshape(len(rows), -1)))
+    out = np.zeros((2, grid.n_sites))
     for values, unit in zip(out, (1, 1j), strict=True):
         for start in range(0, grid.n_sites, CHUNK):
-            rows = unit * np.eye(CHUNK, grid.n_sites, start)[:grid.n_sites - start]
-            field, parameters, terms = cover.solved(rows.T)
-            y = np.zeros(1) if columns is None else np.tensordot(terms.T, columns, axes=1)
-            rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
-            if alone is not None:
-                grown = np.real(grid.views.z_sites.ravel().conj() @ rows.T)
-                rest = rest - grown[:, None, None, None] * alone
-            values[start:start + CHUNK] = of(rest)
+            some = unit * np.eye(CHUNK, grid.n_sites, start)[:grid.n_sites - start]
+            values[start:start + CHUNK] = of(sensitivities(some))
     return out.reshape(2, *grid.views.shape)
 
 
@@ -125,7 +156,7 @@ def plate_variances(model: ModelFit, cover: FieldCovariance,
     marks, (view, mark) = model.equations.columns.grid, np.nonzero(here)
     columns = np.zeros((len(marks), *at.shape), dtype=complex)
     columns[:, view, at[here]] = (marks.reshape(columns.shape)[:, view, mark] * views.phases[view])
-    return added_variances(model, cover, of_marks, columns.reshape(marks.shape))
+    return added_variances(model, cover, of_marks, columns=columns.reshape(marks.shape))
 
 
 TESTED = 5
@@ -156,9 +187,9 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     return found if p < F_LEVEL and 1 + 2 * found.sum() > SAME**2 else np.zeros(0)
 
 
-def correlated_variances(model: ModelFit, cover: FieldCovariance,
-                         correlation: np.ndarray) -> np.ndarray:
-    """Return what correlated noise adds to the variances, (2, nx, ny), for unit noise."""
+def correlated_variances(model: ModelFit, cover: FieldCovariance, correlation: np.ndarray,
+                         rows: np.ndarray | None = None) -> np.ndarray:
+    """Return what correlated noise adds to the variances, as `added_variances`."""
     views = _by_time(model)
 
     def of(rest: np.ndarray) -> np.ndarray:
@@ -171,7 +202,7 @@ def correlated_variances(model: ModelFit, cover: FieldCovariance,
             total += 2 * products @ correlation
         return total
 
-    return added_variances(model, cover, of)
+    return added_variances(model, cover, of, rows)
 
 
 def _by_time(model: ModelFit) -> list[tuple[int, ViewVisits, np.ndarray, np.ndarray]]:

@@ -33,13 +33,10 @@ from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
 from selfcal_ros.estimation.joint.noise_effects import (
+    ADDED,
     MAX_SITES,
-    added_variances,
-    axis_contrast,
-    axis_variances,
-    correlated_variances,
     plate_variances,
-    time_correlation,
+    structured,
 )
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
 from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
@@ -277,10 +274,13 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
         if wanted:
             variance = np.stack(cover.diagonal())
             if system.grid.n_sites <= MAX_SITES:
-                variance = variance + _structured(model, cover)
+                more = structured(model, cover)
+                variance = variance + more
+                if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
+                    kept[ADDED] = structured(model, cover, system.gauge.shear)
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if wanted and model.equations is not None:
-            kept = saved_terms(cover, model.equations.columns, measurements.sense,
+            kept |= saved_terms(cover, model.equations.columns, measurements.sense,
                                _beside_map(model, options, cover, measurements.sense))
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
                                   system.known_lines)
@@ -324,19 +324,6 @@ def _beside_map(model: ModelFit, options: Options, cover: FieldCovariance,
     return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
                 len(plates), 2, *system.grid.views.plate_shape),
             "lines": lines, "microscope": microscope}
-
-
-def _structured(model: ModelFit, cover: FieldCovariance) -> np.ndarray | float:
-    """Return what noise that is neither equal along x and y nor white adds to the variances."""
-    added: np.ndarray | float = 0.0
-    if contrast := axis_contrast(model):
-        added = contrast * axis_variances(model, cover)
-    if len(correlation := time_correlation(model)):
-        added = added + correlated_variances(model, cover, correlation)
-    images = model.problem.images
-    if images is not None and (share := images.noises(model.found.residuals).share):
-        added = added + share * added_variances(model, cover, images.added)
-    return added
 
 
 def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> ArtifactMap:

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise that is correlated in time, against one dense least squares and the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint import solve
+from selfcal_ros.estimation.comparison.covariance import first_order_u
+from selfcal_ros.estimation.joint import noise_effects, solve
 from selfcal_ros.estimation.joint.noise_effects import time_correlation
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.options import Options
@@ -29,11 +32,19 @@ def measured(size, seed=0, *, sense=Sense.MICROSCOPE_MOVES, slow_m=0.0):
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
+def u_of_first_order(dense, artifact):
+    """Return the u of O and R by the least squares of the dense map on a whole square field."""
+    x, y = artifact.x_m.ravel(), artifact.y_m.ravel()
+    rows = np.stack([np.concatenate(pair) for pair in ((y, x), (x, -y))]) / (x @ x + y @ y)
+    rows = rows @ dense.to_map
+    return tuple(np.sqrt(np.diag(rows @ dense.covariance @ rows.T)))
+
+
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("text", ["", SIZED])
 @pytest.mark.parametrize("correlation", [[0.6, 0.3, 0.1], [-0.4, 0.1]])
 def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlation, sense):
-    monkeypatch.setattr(solve, "time_correlation", lambda model: np.array(correlation))
+    monkeypatch.setattr(noise_effects, "time_correlation", lambda model: np.array(correlation))
     _, readings = measured(5, sense=sense)
     terms = parse_terms([text], "") if text else ()
     result = solve_joint(readings, Options(terms=terms, assumed=(), causes=False,
@@ -44,6 +55,11 @@ def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlat
     _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
     assert np.allclose(emap.u_gx, u_x, rtol=1e-6, atol=0)
     assert np.allclose(emap.u_gy, u_y, rtol=1e-6, atol=0)
+    white = first_order_u(replace(result, extra={
+        key: value for key, value in result.extra.items() if key != noise_effects.ADDED}))
+    found = first_order_u(result)
+    assert found == pytest.approx(u_of_first_order(dense, readings.artifact), rel=1e-5)
+    assert found != pytest.approx(white, rel=0.02)
 
 
 def test_slow_noise_is_in_the_uncertainty(monkeypatch):
