@@ -51,7 +51,7 @@ def read_result(path: str | os.PathLike, limit: int | None = None) -> Calibratio
 def result_bytes(path: str | os.PathLike, limit: int | None = None) -> tuple[str, bytes]:
     """Return name and content of a result; those of any other file that is no bag as they are."""
     found, name = bag_files(Path(path)), ""
-    if not found and not Path(path).exists():
+    if not found and not os.path.exists(path):  # False too for a name that no file can have
         found, name = bag_files(Path(path).parent), Path(path).name
     if not found:
         return str(path), read_bytes(path, limit)

@@ -67,11 +67,11 @@ class FaultyCell(StageSimulator):
         if self.fault != "never revisits":
             super()._on_status(message)
 
-    def _measure(self, command):
+    def _measure(self, command, missing=()):
         if self.fault == "no check stops":
             command = replace(command, view=replace(
                 command.view, check_marks=0, check_offset_m=0.0))
-        super()._measure(command)
+        super()._measure(command, missing)
 
     def _publish(self, event):
         is_detection = isinstance(event, Detection)
