@@ -81,7 +81,7 @@ RESULT = {
                "`sentence`, `reasons`, `failed` (the tests that failed, as `findings`), "
                "`enlarged_by` (each name, u_rms, u_max, unit), and `causes`, most likely first: as "
                "`findings`, and effect_rms, effect_max, told (whether the readings determine it "
-               "all), remedies (a list of {model}, {view} to measure again, {action})",
+               "all), remedies (a list of {model}, {map}, {view} to measure again, {action})",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
              "(view, component, value, u, unit), "
              "size_used (if the readings contradict the size), source (declared, default, "

@@ -27,6 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="print the uncertainty budget of the map (GUM)")
     parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
                         "compared with the truth if the bag has one")
+    parser.add_argument("--map", metavar="NODES[:INTERPOLATION]", help="nodes a side of the map "
+                        "over the field of the plan's, bicubic (default) or bilinear, instead of "
+                        "those of the plan, e.g. 9:bicubic")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
@@ -170,6 +173,7 @@ def run(args: argparse.Namespace) -> int:
     said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
     for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
+    measurements = _with_map(args, measurements)
     options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
     for name in ("validate", "robust"):
         if options.plate is not None and getattr(args, name):
@@ -200,6 +204,17 @@ def run(args: argparse.Namespace) -> int:
         lines += _budget(result) if args.budget else []
         print("\n".join(lines), end="\n" * bool(lines), file=aside(args))
     return exit_code(result)
+
+
+def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
+    """Return the readings with the nodes of --map, if it is given."""
+    from dataclasses import replace
+
+    from selfcal_ros.model.artifact import with_nodes
+
+    if not args.map:
+        return measurements
+    return replace(measurements, artifact=with_nodes(measurements.artifact, args.map, "--map"))
 
 
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The artifact plate: a grid of marks and a circle of angular lines."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from math import ceil, sqrt
@@ -355,3 +355,16 @@ def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
                 **count}
     return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m, **count,
             **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})}
+
+
+def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
+    """Return the plate with a map of NODES[:INTERPOLATION] over the same field."""
+    size, _, interpolation = text.partition(":")
+    if not (size.isdecimal() and int(size) >= 3 and int(size) % 2):
+        raise InputError(where, f"'{text}' is not NODES[:INTERPOLATION]",
+                         "give an odd number of nodes a side from 3 on, e.g. 9:bicubic")
+    given = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
+    field = artifact.field
+    if field.half[0] == field.half[1]:
+        given["grid_pitch"] = 2 * field.half[0] * field.grid_pitch_m / (int(size) - 1)
+    return replace(artifact, map_grid=map_grid_of(given, artifact, where))

@@ -2,7 +2,7 @@
 """Terms of the measurement model in addition to stage, plate and misalignments."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -120,6 +120,12 @@ class ModelTerm:
         """Return the term with all its sizes multiplied by `factor`."""
         return ModelTerm(self.name, self.size * factor, tuple(factor * p for p in self.parts))
 
+    @property
+    def rounded_up(self) -> "ModelTerm":
+        """The term with its size rounded up to two figures."""
+        power = 10.0 ** (math.floor(math.log10(self.size)) - 1)
+        return ModelTerm(self.name, float(f"{math.ceil(self.size / power) * power:.1e}"))
+
     def __str__(self) -> str:
         """Return the term as written in an option."""
         sizes = self.parts or (() if self.free else (self.size,))
@@ -228,3 +234,9 @@ def terms_of(texts: list, where: str) -> tuple[str, ...]:
         if not isinstance(text, str):
             raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
     return tuple(str(term) for term in parse_terms(texts, where))
+
+
+def merged(terms: Iterable[ModelTerm], more: Collection[ModelTerm]) -> tuple[ModelTerm, ...]:
+    """Return `terms` with `more`, which replace those of the same name."""
+    named = {term.name for term in more}
+    return (*(term for term in terms if term.name not in named), *more)

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Remedy:
-    """Remedy for a cause: solve with a `model`, measure a `view` (again), or an `action`."""
+    """Remedy for a cause: solve with a `model` or `map`, measure a `view`, or an `action`."""
 
-    kind: Literal["model", "view", "action"]
+    kind: Literal["model", "map", "view", "action"]
     value: str
 
 

@@ -9,9 +9,11 @@ import pytest
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.unseen import equivalent_key
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.roughness import adequacy_of
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
@@ -55,8 +57,9 @@ def test_the_dense_solution_is_the_same(name):
     field, u = (both[:, known] for both in dense(found, known))
     assert np.stack([result.error_map.gx, result.error_map.gy])[:, known] == pytest.approx(
         field, abs=1e-13)
+    lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy[:, known]
     assert np.stack([result.error_map.u_gx, result.error_map.u_gy])[:, known] == pytest.approx(
-        u * result.noise.sigma_xy, rel=1e-5)
+        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-5)
 
 
 def as_list(found: Measurements, artifact: Artifact) -> Measurements:

@@ -10,8 +10,8 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.verdict.roughness import known_places
-from selfcal_ros.model.artifact import Interpolation, MapGrid
+from selfcal_ros.estimation.verdict.roughness import adequacy_of, known_places
+from selfcal_ros.model.artifact import Interpolation, MapGrid, with_nodes
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
@@ -37,8 +37,9 @@ def test_the_dense_solution_is_the_same():
     result = calibrate(found, LINEAR)
     field, u = dense(found)
     assert np.stack([result.error_map.gx, result.error_map.gy]) == pytest.approx(field, abs=1e-15)
+    lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy
     assert np.stack([result.error_map.u_gx, result.error_map.u_gy]) == pytest.approx(
-        u * result.noise.sigma_xy, rel=1e-6)
+        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-6)
 
 
 def test_on_the_lattice_the_map_is_that_of_the_lattice():
@@ -143,6 +144,41 @@ def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
         contradicted += named
     assert contradicted >= 11 if rough else contradicted == 0
     assert 0.93 < np.mean(inside) <= 1.0
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
+    """What lies between the nodes goes into no term; a plate that is bent as well is found."""
+    inside = []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 9])
+        found, truth = readings(plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6,
+                                stage=waves(rng, 3))
+        if bent:
+            views = [replace(v, dy=v.dy + (v.view.name == found.views[1].view.name) * 2e-6
+                             * (v.m / 4) ** 2) for v in found.views]
+            found = replace(found, views=tuple(views))
+        result = calibrate(found, Options(assumed=()))
+        named = [cause.name for cause in result.verdict.causes]
+        assert "roughness" in named or bent
+        assert ("plate_shape" in named) == bent
+        u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+        error = error_in_datum(result.error_map, truth)
+        inside.append(np.mean(np.abs(error) < result.noise.k_xy * u))
+    assert np.mean(inside) > 0.93
+
+
+def test_a_map_that_was_tried_is_the_remedy():
+    """The nodes suffice for the stage once the map is bicubic, and the readings show that."""
+    rng = np.random.default_rng([1, 9])
+    wave = waves(rng, 4)
+    found, _ = readings(plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6, stage=wave)
+    (cause,) = calibrate(found, Options(assumed=())).verdict.causes
+    assert cause.name == "roughness" and [
+        (remedy.kind, remedy.value) for remedy in cause.remedies] == [("map", "7:bicubic")]
+    better = replace(found, artifact=with_nodes(found.artifact, "7:bicubic", ""))
+    assert better.artifact.field.grid_pitch_m == found.artifact.field.grid_pitch_m
+    assert calibrate(better, Options(assumed=())).verdict.grade == "good"
 
 
 def test_no_noise_and_no_roughness_is_no_lack():

@@ -9,7 +9,7 @@ solves the same factored equations (Gauss-Newton).
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread, scale_of_plate
 from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
-from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, noise_excess, sigma_of
+from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
@@ -34,9 +34,9 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_columns,
     reduce_lines,
 )
-from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
+from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import without_noise
-from selfcal_ros.model.terms import OF_PLATE, SHARED, ModelTerm, TermName
+from selfcal_ros.model.terms import OF_PLATE, TermName
 
 MAX_STEPS = 100
 
@@ -124,63 +124,8 @@ class ModelFit:
                           now.inverse(self.found.xy.sigma), of_marks, now.projected.turned)
 
 
-def fit_model(problem: Problem,
-              check: Callable[[TermEquations], None] = lambda equations: None) -> ModelFit:
-    """Return the joint least-squares solution of the whole model.
-
-    A term's size that the readings rule out would bend the map with nothing to show it: the fit is
-    repeated with the largest size that they allow. A term that all views share comes first if it
-    explains all by itself: marks that turn against lines as a microscope of another scale turns
-    them are no plates that moved between both.
-
-    Parameters
-    ----------
-    problem : Problem
-        Readings and model.
-    check : callable
-        Called with the equations of the terms before they are solved; may raise.
-
-    Raises
-    ------
-    NotSettledError, InputError
-        If the rotations do not settle, or a term needs what the readings do not tell.
-    """
-    model = _settled(problem, check)
-    sizes = _size_tests(model, problem.terms)
-    if not any(test.contradicted for test in sizes):
-        return replace(model, sizes=sizes)
-    for term in problem.terms:
-        alone = _size_tests(model, [term] if term.name in SHARED else [])
-        if any(test.contradicted for test in alone):
-            simpler = _settled(_raised(problem, alone), check)
-            rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
-            if not any(test.contradicted for test in rest):
-                return replace(simpler, sizes=(*alone, *rest))
-    return replace(_settled(_raised(problem, sizes), check), sizes=sizes)
-
-
-def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
-    """Return the problem with the sizes that the readings allow where they contradict them."""
-    allowed = {test.name: test.allowed for test in sizes if test.contradicted}
-    return replace(problem, terms=tuple(
-        term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
-        for term in problem.terms))
-
-
-def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ...]:
-    """Return the tests of the sizes of terms; none without a noise to test them by."""
-    equations = model.equations
-    if equations is None or equations.free.all():
-        return ()
-    scored = score(equations, model.found.both_residuals, squares(model.problem, model.found),
-                   coefficients=model.coefficients)
-    right = scored.total + equations.information @ model.coefficients
-    noise, excess = model.found.xy, noise_excess(model.problem, model.found.residuals)
-    return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))
-
-
-def _settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
-    """Iterate to the solution with the present sizes; see `fit_model`."""
+def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
+    """Return the solution with the sizes as they are; arguments as `finer.fit_model`."""
     state = _State(problem)
     if state.equations is not None:
         check(state.equations)

@@ -29,9 +29,10 @@ from selfcal_ros.estimation.datum.plate import (
     plate_covariance,
     plates_of_terms,
 )
+from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
 from selfcal_ros.estimation.joint.images import image_noise
-from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
+from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
     MAX_SITES,

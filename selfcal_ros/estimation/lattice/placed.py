@@ -81,10 +81,14 @@ class Axis:
         """Coefficients for a unit at each node, (n, n)."""
         if not self.by_nodes:
             return np.eye(len(self.nodes))
-        values, first = self.rows(self.nodes)
-        dense = np.zeros((len(self.nodes), len(self.nodes)))
+        return np.linalg.inv(self.matrix(self.nodes))
+
+    def matrix(self, at: np.ndarray) -> np.ndarray:
+        """Return the values of all B-splines at places, (P, n)."""
+        values, first = self.rows(at)
+        dense = np.zeros((len(at), len(self.nodes)))
         np.put_along_axis(dense, first, values, axis=1)
-        return np.linalg.inv(dense)
+        return dense
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +121,12 @@ class MapSpline:
     def refined(self) -> "MapSpline":
         """The spline with twice as many intervals along each axis: it contains this one."""
         return MapSpline((self.axes[0].refined, self.axes[1].refined), self.pitch_m)
+
+    def within(self, finer: "MapSpline") -> np.ndarray:
+        """Return the matrix to the coefficients of a refined spline, which contains this one."""
+        axes = [np.linalg.solve(fine.matrix(fine.nodes), axis.matrix(fine.nodes) @ axis.from_nodes)
+                for axis, fine in zip(self.axes, finer.axes, strict=True)]
+        return np.kron(*axes)
 
     @property
     def places_m(self) -> np.ndarray:

@@ -148,6 +148,11 @@ class GridSystem:
         """Return the adjoint coupling of fields (sites, ...) to phi, Re, Im tau, (3 views, ...)."""
         return of_misalignments((self.columns @ fields.conj()).conj())
 
+    @property
+    def real_columns(self) -> np.ndarray:
+        """The coupling of sites to phi, Re tau, Im tau, complex (sites, 3 views)."""
+        return _real_columns(self.columns.T.reshape(self.n_sites, self.n_views, 2))
+
     @cached_property
     def block(self) -> np.ndarray:
         """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""

@@ -18,6 +18,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
+from selfcal_ros.estimation.joint.finer import is_too_large
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -26,7 +27,6 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations, free_inverse
 from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
-from selfcal_ros.estimation.verdict.roughness import is_untested
 from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, is_searched, search_causes
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
@@ -199,7 +199,7 @@ def _axes_findings(solved: Solved) -> list[Finding]:
 
 def _untested(solved: Solved) -> list[Finding]:
     """Return a finding if the map has too many nodes to test whether they suffice."""
-    untested = solved.model is not None and is_untested(solved.model)
+    untested = solved.model is not None and is_too_large(solved.model.problem)
     return [Finding("roughness_untested")] if untested else []
 
 

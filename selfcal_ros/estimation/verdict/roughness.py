@@ -8,19 +8,23 @@ is the lack of fit, a part of the uncertainty at the nodes and between them (eq.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.special import fdtrc
 
+from selfcal_ros.estimation.joint.finer import is_too_large, told_coefficients, with_map
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.connectivity import Gauge
+from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import GAP, grid_residuals
-from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem
+from selfcal_ros.estimation.normal.placed import PlacedEquations
 from selfcal_ros.estimation.verdict.uncertainty import Effect
+from selfcal_ros.model.artifact import Interpolation, with_nodes
+from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Cause
 
@@ -30,8 +34,8 @@ NAME = "roughness"
 ADEQUACY_LEVEL = 1e-3
 """Probability that a map that suffices fails the test."""
 
-MAX_COEFFICIENTS = 31 * 31
-"""Largest refined spline that is fitted: a second of one processor."""
+SIZES = (1e-2, 1e6, 65)
+"""Sizes of the further coefficients that are tried, in the noise of the best told, and number."""
 
 NOISE_FREE_M = 1e-13
 """Noise that is rounding, m: a map that leaves no more than that suffices."""
@@ -47,6 +51,8 @@ class Adequacy:
         Probability of such an improvement by chance.
     lack : float
         Standard uncertainty from the lack of fit: one coordinate, m, or of the angular map, rad.
+    local : float array (2, nx, ny)
+        That of the nodes for themselves, frame of the equations, m; empty for the angular map.
     coefficients : float
         Further coefficients that the readings determine.
     nodes : tuple of int
@@ -57,6 +63,7 @@ class Adequacy:
     lack: float
     coefficients: float
     nodes: tuple[int, ...]
+    local: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def of_lines(self) -> bool:
@@ -73,8 +80,9 @@ class Adequacy:
             return Effect(NAME, np.zeros((2, *emap.gx.shape)), np.where(
                 np.isfinite(emap.g_theta), self.lack, 0.0))
         sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
-        each = np.where(emap.valid, sign * self.lack, 0.0)
-        return Effect(NAME, np.stack([each, each]), np.zeros(len(emap.g_theta)))
+        local = self.local if result.sense == Sense.MICROSCOPE_MOVES else self.local[:, ::-1, ::-1]
+        each = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
+        return Effect(NAME, each, np.zeros(len(emap.g_theta)))
 
     @property
     def cause(self) -> Cause | None:
@@ -101,21 +109,60 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         A fit; finite rotations and terms are taken off its readings.
     """
     system = model.problem.system
-    if not isinstance(system, PlacedEquations) or is_untested(model):
+    if not isinstance(system, PlacedEquations) or is_too_large(model.problem):
         return None
-    grid = system.grid
-    finer = grid.views.spline.refined
-    fine = PlacedEquations(PlacedSystem(grid.views.poses, grid.weight, finer),
-                           AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
-    parts = [(one, _effective(one), _squares(one, model.y)) for one in (fine, system)]
-    (_, n_fine, rest), (_, n_coarse, before) = parts
+    grid, coarse = system.grid, _of_marks(model)
+    other = with_map(model, grid.views.spline.refined)
+    if other is None:
+        return None
+    fine, n = _of_marks(other), [told_coefficients(one) for one in (_of_marks(other), coarse)]
+    before, rest = _squares(coarse, model.y), _squares(fine, other.y)
     readings = 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (3 * grid.n_views - 7)
-    more, dof = n_fine - n_coarse, readings - n_fine
-    if dof < 1 or more < 1:
-        return None
-    sigma_m = float(np.sqrt(rest / dof))
-    p = _improved(before, rest, more, dof)
-    return Adequacy(p, _lack(fine, system, model.y, sigma_m), more, grid.views.shape)
+    more, dof, p = n[0] - n[1], readings - n[0], 1.0
+    power = np.zeros(2 * len(known_places(coarse)))
+    if dof >= 1 and more >= 1:
+        p = _improved(before, rest, more, dof)
+        if p < 1.0:
+            power = _Further.of(fine, coarse, other.y).power(
+                max(float(np.sqrt(rest / dof)), NOISE_FREE_M))
+        power = power + _of_terms(model, other) ** 2 * (p < ADEQUACY_LEVEL)
+    if grid.views.spline.axes[0].degree == 1 and before > readings * NOISE_FREE_M**2:
+        smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
+        if (other := with_map(model, smooth)) is not None:
+            rest = max(_squares(_of_marks(other), other.y), NOISE_FREE_M * before)
+            likelier = math.exp(min((readings - n[1]) / 2 * math.log(rest / before), 0.0))
+            p, apart = min(p, likelier), _apart(other, model)
+            power = apart if likelier < ADEQUACY_LEVEL and apart.mean() > power.mean() else power
+    local = np.zeros((2, *grid.views.shape))
+    i, j = _halves(coarse)
+    nodes = (i % 2 == 0) & (j % 2 == 0)
+    local[:, i[nodes] // 2, j[nodes] // 2] = np.sqrt(power.reshape(2, -1)[:, nodes])
+    return Adequacy(p, float(np.sqrt(power.mean())), more, grid.views.shape, local)
+
+
+def _of_marks(model: ModelFit) -> PlacedEquations:
+    """Return the equations of the marks alone."""
+    system = cast(PlacedEquations, model.problem.system)
+    return PlacedEquations(system.grid, AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
+
+
+def _of_terms(model: ModelFit, other: ModelFit) -> float:
+    """Return what the terms change of a map by what another map makes of them, rms, m."""
+    if model.equations is None:
+        return 0.0
+    moved = model.equations.maps @ (other.coefficients - model.coefficients)
+    return float(np.sqrt((np.abs(moved) ** 2).mean() / 2))
+
+
+def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Yield the readings with smoother or closer nodes over the same field, and their --map."""
+    artifact, grid = measurements.artifact, measurements.artifact.map_grid
+    if grid is None or grid.size_y not in (0, grid.size):
+        return
+    first = grid.size + 2 * (grid.interpolation is Interpolation.BICUBIC)
+    for size in range(first, min(artifact.shape), 2):
+        text = f"{size}:{Interpolation.BICUBIC}"
+        yield text, replace(measurements, artifact=with_nodes(artifact, text, "map"))
 
 
 def _improved(before: float, rest: float, more: float, dof: float) -> float:
@@ -155,50 +202,112 @@ def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarr
     return float((lines.weight * rest**2).sum()), field - field.mean()
 
 
-def is_untested(model: ModelFit) -> bool:
-    """Return whether a map has too many nodes for the test of their number."""
-    system = model.problem.system
-    return isinstance(system, PlacedEquations) and (
-        math.prod(system.grid.views.spline.refined.shape) > MAX_COEFFICIENTS)
-
-
 def known_places(system: PlacedEquations) -> np.ndarray:
     """Return the known nodes and the middles between known nodes, complex (P,), m."""
-    views, known = system.grid.views, system.known_sites
-    s, t = np.indices([2 * size - 1 for size in views.shape]).reshape(2, -1)
-    low, high = (s // 2, t // 2), ((s + 1) // 2, (t + 1) // 2)
-    inside = known[low] & known[high] & known[low[0], high[1]] & known[high[0], low[1]]
-    x, y = s[inside] / 2 - views.half[0], t[inside] / 2 - views.half[1]
+    (s, t), views = _halves(system), system.grid.views
+    x, y = s / 2 - views.half[0], t / 2 - views.half[1]
     return (x + 1j * y) * views.spline.pitch_m
 
 
-def _effective(system: PlacedEquations) -> float:
-    """Return the real coefficients of the map that the readings determine."""
-    factor, n = system.grid.factor, system.grid.n_sites
-    return 2 * (n - system.grid.vague * float(factor.inverse_diagonal().sum()))
+def _halves(system: PlacedEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same places in half pitches of the map from its first node, int (P,) each."""
+    known = system.known_sites
+    s, t = np.indices([2 * size - 1 for size in system.grid.views.shape]).reshape(2, -1)
+    low, high = (s // 2, t // 2), ((s + 1) // 2, (t + 1) // 2)
+    inside = known[low] & known[high] & known[low[0], high[1]] & known[high[0], low[1]]
+    return s[inside], t[inside]
 
 
 def _squares(system: PlacedEquations, y: np.ndarray) -> float:
     return float((system.grid.weight * np.abs(grid_residuals(system, y)) ** 2).sum())
 
 
-def _lack(fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray, sigma_m: float) -> float:
-    """Return the rms difference of two maps of the same readings beyond their noise, m.
+def _apart(one: ModelFit, other: ModelFit) -> np.ndarray:
+    """Return the squared difference of two maps of the same readings at places, (2 P,), m^2."""
+    at = known_places(_of_marks(other))
+    rigid = _rigid(at)
+    field = _alone(one, at) - _alone(other, at)
+    field = field - rigid @ np.real(rigid.conj().T @ field)
+    return np.concatenate([field.real, field.imag]) ** 2
 
-    One coordinate, over the nodes and the middles between them where the map is known.
+
+def _alone(model: ModelFit, at: np.ndarray) -> np.ndarray:
+    """Return the map of the marks alone at places, in no particular datum, complex (P,), m."""
+    system = _of_marks(model)
+    free, d = system.grid.reduced(model.y)
+    field = free - system.grid.response @ (system.grid_inverse @ d)
+    spline = system.grid.views.spline
+    return spline.rows(at) @ spline.coefficients(field.reshape(spline.shape)).ravel()
+
+
+def _rigid(at: np.ndarray) -> np.ndarray:
+    """Return the orthonormal datum modes at places, complex (P, 4)."""
+    return Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True).orthonormal
+
+
+@dataclass(frozen=True, eq=False)
+class _Further:
+    """What the readings tell of the coefficients e by which a refined map differs from a coarse.
+
+    The refined map is the coarse one and Z e, Z e = 0 at the nodes; all else is eliminated.
+
+    Attributes
+    ----------
+    told : float array (2 n,)
+        Eigenvalues of the information on e, real and imaginary parts, for unit noise.
+    right : float array (2 n,)
+        Right-hand side along its eigenvectors, m.
+    error : float array (2 P, 2 n)
+        Error of the coarse map at places, datum taken out, for a unit along each eigenvector.
     """
-    at = known_places(coarse)
-    rigid = Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True).orthonormal
-    values, powers = [], []
-    for system in (fine, coarse):
-        spline = system.grid.views.spline
-        rows = spline.rows(at)
-        by_nodes = csr_matrix(spline.adjoint(rows.toarray().reshape(
-            len(at), *spline.shape)).reshape(len(at), -1)) if system is coarse else rows
-        free, d = system.grid.reduced(y)
-        field = by_nodes @ (free - system.grid.response @ (system.grid_inverse @ d))
-        values.append(field - rigid @ np.real(rigid.conj().T @ field))
-        powers.append(sum(part.mean() for part in system.variance(
-            by_nodes, rigid, system.grid_inverse)))
-    square = float((np.abs(values[0] - values[1]) ** 2).mean())
-    return float(np.sqrt(max(square - sigma_m**2 * (powers[0] - powers[1]), 0.0) / 2))
+
+    told: np.ndarray
+    right: np.ndarray
+    error: np.ndarray
+
+    @classmethod
+    def of(cls, fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray) -> "_Further":
+        """Return it for refined and coarse equations of the same readings y."""
+        at, grid = known_places(coarse), fine.grid
+        spline, nodes = grid.views.spline, coarse.grid.views.spline
+        matrix, couple = grid.matrix, grid.real_columns
+        b, d = grid.right_side(y)
+        within = np.linalg.pinv(grid.block, hermitian=True, rcond=GAP)
+        both = np.concatenate([couple.real, couple.imag])
+        held = both @ within
+        normal = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
+        normal -= held @ both.T
+        right = np.concatenate([b.real, b.imag]) - held @ d
+        contained = nodes.within(spline)
+        further = np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
+        inside, beside = (np.kron(np.eye(2), part) for part in (contained, further))
+        answer = np.linalg.pinv(inside.T @ normal @ inside, hermitian=True,
+                                rcond=GAP) @ (inside.T @ normal)
+        left = beside.T @ (normal - normal @ inside @ answer)
+        told, vectors = np.linalg.eigh(left @ beside)
+        moved = (inside @ (answer @ beside) - beside) @ vectors
+        scalar = np.asarray(spline.rows(at) @ np.hstack(np.split(moved, 2)))
+        field = scalar[:, :moved.shape[1]] + 1j * scalar[:, moved.shape[1]:]
+        rigid = _rigid(at)
+        field -= rigid @ np.real(rigid.conj().T @ field)
+        alone = right - normal @ inside @ (np.linalg.pinv(
+            inside.T @ normal @ inside, hermitian=True, rcond=GAP) @ (inside.T @ right))
+        return cls(np.maximum(told, 0.0), vectors.T @ (beside.T @ alone),
+                   np.concatenate([field.real, field.imag]))
+
+    def size(self, sigma_m: float) -> float:
+        """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
+        seen = self.told > GAP * self.told.max()
+        told, right = self.told[seen], self.right[seen]
+        least = sigma_m / np.sqrt(told.max())
+        sizes = np.concatenate([[0.0], least * np.geomspace(*SIZES)])
+        variance = told * sigma_m**2 + np.multiply.outer(sizes, told) ** 2
+        return float(sizes[(np.log(variance) + right**2 / variance).sum(axis=1).argmin()])
+
+    def power(self, sigma_m: float) -> np.ndarray:
+        """Return the mean squared error of the coarse map at the places (eq. 12.6), (2 P,), m^2."""
+        size = self.size(sigma_m)
+        if not size:
+            return np.zeros(len(self.error))
+        share = size**2 / (sigma_m**2 + size**2 * self.told)
+        return (self.error @ (share * self.right))**2 + self.error**2 @ (share * sigma_m**2)

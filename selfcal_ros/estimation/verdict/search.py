@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.joint.finer import finer
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -35,7 +36,7 @@ from selfcal_ros.estimation.verdict.explanations import (
     find_explanations,
 )
 from selfcal_ros.estimation.verdict.off_sites import READING, off_sites_cause
-from selfcal_ros.estimation.verdict.roughness import adequacies_of
+from selfcal_ros.estimation.verdict.roughness import adequacies_of, maps_to_try
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
@@ -44,7 +45,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm, TermName, merged
 from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 
 ALWAYS_SITES = 41 * 41
@@ -147,7 +148,9 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
             causes.append(turned)
     for rough in adequacies_of(_model(solved)):
         found.effects.append(rough.effect(solved.result))
-        causes += [rough.cause] if rough.cause else []
+        if (cause := rough.cause) is not None:
+            nodes = _better_map(measurements, options) if advise and not rough.of_lines else ""
+            causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
     if place is not None:
         causes = [place.cause, *causes] if place.shown else [*causes, place.cause]
         found.effects.append(effect_of_field(
@@ -164,13 +167,24 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     return replace(out, causes=tuple(_advised(cause, model, out.terms, faulty) for cause in causes))
 
 
+def _better_map(measurements: Measurements, options: Options) -> str:
+    """Return the first map (--map) with which nothing contradicts these readings; else empty."""
+    for text, readings in maps_to_try(measurements):
+        solved = solved_with(readings, options, ())
+        if solved is None or solved.xy.contradicted or solved.theta.contradicted:
+            continue
+        if not search_causes(solved, readings, options, failed=False, advise=False).causes:
+            return text
+    return ""
+
+
 def _advised(cause: Cause, model: str | None, terms: Collection[str],
              faulty: Collection[str]) -> Cause:
     """Return a cause with its remedies: a model that was tried, a view to measure again.
 
     Measuring again does not remove the causes `faulty`.
     """
-    remedies = []
+    remedies = [*cause.remedies]
     if model is not None and cause.name in terms:
         remedies.append(Remedy("model", model))
     if cause.view and cause.name not in faulty:
@@ -188,7 +202,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
     used = {term.name: term for term in _model(searched.solved).problem.terms}
     best, least = None, np.inf
     for free in (True, False):
-        terms = [ModelTerm(TermName(name)) if free else _rounded_up(used[TermName(name)])
+        terms = [ModelTerm(TermName(name)) if free else used[TermName(name)].rounded_up
                  for name in searched.terms]
         solved = solved_with(measurements, options, terms)
         if solved is None or solved.xy.contradicted or solved.theta.contradicted:
@@ -196,22 +210,10 @@ def _best_model(searched: SearchResult, measurements: Measurements,
         emap = solved.result.error_map
         u = rms(np.stack([emap.u_gx, emap.u_gy])) + rms(np.nan_to_num(emap.u_g_theta))
         again = search_causes(solved, measurements, replace(
-            options, terms=_merged(options.terms, terms)), failed=False, advise=False)
+            options, terms=merged(options.terms, terms)), failed=False, advise=False)
         if not again.causes and u < least:
-            best, least = ",".join(map(str, _merged(options.terms, terms))), u
+            best, least = ",".join(map(str, merged(options.terms, terms))), u
     return best
-
-
-def _rounded_up(term: ModelTerm) -> ModelTerm:
-    """Return a term with its size rounded up to two figures."""
-    power = 10.0 ** (np.floor(np.log10(term.size)) - 1)
-    return ModelTerm(term.name, float(f"{np.ceil(term.size / power) * power:.1e}"))
-
-
-def _merged(terms: Iterable[ModelTerm], more: Collection[ModelTerm]) -> tuple[ModelTerm, ...]:
-    """Return `terms` with `more`, which replace those of the same name."""
-    named = {term.name for term in more}
-    return (*(term for term in terms if term.name not in named), *more)
 
 
 def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
@@ -277,7 +279,10 @@ def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     if found or failed:
         found = [item for item in find_explanations(model, slips=True)
                  if failed or _counts(item, solved)]
-    return found
+    if not found or (fine := finer(model)) is None:
+        return found
+    still = {item.name for item in find_explanations(fine, slips=True)}
+    return [item for item in found if item.name in still]
 
 
 def _counts(found: Explanation, solved: Solved) -> bool:
@@ -296,7 +301,7 @@ def solved_with(measurements: Measurements, options: Options,
                 terms: Collection[ModelTerm]) -> Solved | None:
     """Return the solution with further terms; None if there is none."""
     try:
-        return solve_joint(measurements, replace(options, terms=_merged(options.terms, terms)))
+        return solve_joint(measurements, replace(options, terms=merged(options.terms, terms)))
     except (NotIdentifiableError, InputError):
         return None
 

@@ -306,7 +306,8 @@ def remedies(cause: Cause) -> tuple[Remedy, ...]:
 def advice(cause: Cause) -> str:
     """Return what to do about a cause; empty if a file has it only in the text of the cause."""
     return "" if cause.details is None else ", or ".join(
-        f"solve with --model {remedy.value}" if remedy.kind == "model" else remedy.value
+        f"solve with --{remedy.kind} {remedy.value}" if remedy.kind in ("model", "map")
+        else remedy.value
         for remedy in remedies(cause) if remedy.kind != "view")
 
 

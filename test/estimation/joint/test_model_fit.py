@@ -8,7 +8,8 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint import model_fit
-from selfcal_ros.estimation.joint.model_fit import fit_model, squares
+from selfcal_ros.estimation.joint.finer import fit_model
+from selfcal_ros.estimation.joint.model_fit import squares
 from selfcal_ros.estimation.joint.problem import own_rotations
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.grid import GridSystem
@@ -106,5 +107,5 @@ def test_rotations_settle_in_four_steps_from_what_the_views_show(monkeypatch):
                                      rng, sigma_m=2e-8)
     fits, plain = [], model_fit.fit
     monkeypatch.setattr(model_fit, "fit", lambda *args: fits.append(1) or plain(*args))
-    model_fit.fit_model(prepare(readings, BARE)[0])
+    fit_model(prepare(readings, BARE)[0])
     assert len(fits) == 1 + 4

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.model_fit import fit_model
+from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.verdict.explanations import find_explanations
 from selfcal_ros.model.artifact import Artifact
