@@ -197,7 +197,7 @@ def with_prior(result: CalibrationResult, covariance: Covariance) -> Calibration
     told = np.diag(gain @ field.covariance @ gain.T)
     return replace(
         result, error_map=now, budget=_budget(result, now, gain, told),
-        findings=(*result.findings, Finding(PRIOR, size, unit="m", details={
+        findings=(*result.findings, Finding("prior", size, unit="m", details={
             "length_m": length * pitch_m, "u_rms": rms(u),
             "u_rms_without": rms(np.stack([emap.u_gx, emap.u_gy]))})))
 
