@@ -312,12 +312,14 @@ class DetectionsSeen:
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
         missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())
+        came = (*(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
+                *encoder.foreign)
         stage, site = self._stage_and_sites(rows[-LOOKED_AT:], views)
         # if all views are affected the sense may be wrong: it looks like half a turn
         alone = whole and len(views) == 1
         lies = self._lies(rows[-LOOKED_AT:], views) if alone or not whole else ""
         return diagnose(Evidence(
-            rejected, used, missing, encoder.foreign, _span(table["stamp"]), encoder.span_ns,
+            rejected, used, missing, came, _span(table["stamp"]), encoder.span_ns,
             self.commands_ns, encoder.step_s, encoder.max_gap_s, stage, site,
             self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies,
             alone))

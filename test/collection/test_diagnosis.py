@@ -48,20 +48,25 @@ def test_joints_of_other_names_are_named():
     cell.samples = [replace(s, names=("X1", "Y1", "theta")) for s in cell.samples]
     assert findings(cell.events) == {None: (
         "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample of the "
-        "joint 'x', 'y' came; names that came: 'X1', 'Y1'; set joint_x, joint_y, joint_theta")}
+        "joint 'x', 'y' came; names that came: 'theta', 'X1', 'Y1'; set joint_x, joint_y, "
+        "joint_theta")}
     cell.samples = [replace(s, names=("x", "Y1", "theta")) for s in cell.samples]
-    assert "of the joint 'y' came; names that came: 'Y1';" in findings(cell.events)[None]
+    assert "'y' came; names that came: 'x', 'theta', 'Y1';" in findings(cell.events)[None]
     cell.samples = []
     assert "of the joint 'x', 'y' came; names that came: none;" in findings(cell.events)[None]
 
 
 def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
     cell = scene("0", line=True)
-    cell.samples = [replace(s, names=("x", "y", "rz")) for s in cell.samples]
-    found = findings(cell.events)
-    assert list(found) == [1]
-    assert found[1].startswith("8 of 8 detections were rejected as no_encoder_sample_near: no "
-                               "encoder sample of the joint 'theta' came; names that came: 'rz';")
+    samples = cell.samples
+    for names, came in ((("x", "y", "rz"), "'x', 'y', 'rz'"), (("x", "y"), "'x', 'y'")):
+        cell.samples = [replace(s, names=names, positions=s.positions[:len(names)])
+                        for s in samples]
+        found = findings(cell.events)
+        assert list(found) == [1]
+        assert found[1].startswith(
+            "8 of 8 detections were rejected as no_encoder_sample_near: no encoder sample of the "
+            f"joint 'theta' came; names that came: {came};")
 
 
 @pytest.mark.parametrize("sense", list(Sense))
