@@ -90,13 +90,17 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     if cell is not None and reader.cells and cell not in reader.cells:
         raise NoDataError(str(path), f"no topics of the cell '/{cell}'", "choose one of "
                           + ", ".join(f"/{name}" for name in sorted(reader.cells)))
-    tail = f" ({'; '.join(reader.lost[-MAX_SAID:])})" if reader.lost else ""
+    tail = f" ({'; '.join(dict.fromkeys(reader.lost[-MAX_SAID:]))})" if reader.lost else ""
     for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
                         ("encoder", ENCODER_TOPIC)):
         if not received[kind]:
             raise NoDataError(str(path), f"no message on {topic}{tail}",
                               f"{topics_like(topic, reader.topics)}record this topic too, see "
                               "the README")
+    if collector.timeline.artifact is None:
+        raise NoDataError(str(path), "no MEASURE command" + (
+            f" that can be used{tail}" if collector.unusable.get(Reason.COMMAND_BAD) else ""),
+                          "readings cannot be assigned to views without one")
     measurements, views = collector.collect()
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
     findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)

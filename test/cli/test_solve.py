@@ -101,7 +101,15 @@ def test_a_topic_without_messages(tmp_path, capsys, events, kind, topic):
 def test_commands_without_measure(tmp_path, capsys, events):
     kept = [e for e in events if not isinstance(e, Command) or e.phase != 1]
     path = Foreign().write(tmp_path / "x.mcap", kept)
-    assert "no MEASURE command" in refused(capsys, 4, path)
+    assert "no MEASURE command; readings" in refused(capsys, 4, path)
+
+
+def test_commands_that_cannot_be_used_are_given_with_the_reason(tmp_path, capsys, events):
+    off = [replace(e, view=replace(e.view, translation_m=(0.003, 0.0)))
+           if isinstance(e, Command) and e.view else e for e in events]
+    said = refused(capsys, 4, Foreign().write(tmp_path / "x.mcap", off))
+    assert "no MEASURE command that can be used (a view command was not used: view '" in said
+    assert said.count("0.3 is not a whole number of pitch steps") == said.count("view '")
 
 
 @pytest.mark.parametrize(("names", "field", "typename"), [
