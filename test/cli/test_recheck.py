@@ -2,6 +2,7 @@
 """``selfcal recheck``: what it prints, writes and refuses."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_json
 
+EXACT = Path(__file__).parents[2] / "bags/hu_exact"
 PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}
 SEEDS = {"seed": 3, "truth": {"phi": 1e-4, "t": 1e-5},
          "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-6}}
@@ -120,3 +122,12 @@ def test_plans_without_the_result_that_they_name(folder, tmp_path, capsys):
     path.write_text(json.dumps(plan | {"artifact_from": str(folder / "r.json")}))
     assert main(["plan", "suggest", str(path)]) == 2
     assert "its plate is known" in capsys.readouterr().err
+
+
+def test_readings_without_noise_are_refused_in_one_line(tmp_path, capsys):
+    out = str(tmp_path / "r.json")
+    assert main(["solve", str(EXACT), "-o", out, "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["recheck", out, str(EXACT)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "readings: they, or those of the calibration, have no noise to compare" in line

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from selfcal_ros.errors import NotIdentifiableError, NotSettledError
+from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
@@ -73,8 +73,17 @@ def least_squares(design: np.ndarray, noise: np.ndarray, held: np.ndarray,
     vague : float
         Information on every unknown, relative to the mean. What the readings do not determine has
         no rows, as if it were 0: `free` tells it.
+
+    Raises
+    ------
+    InputError
+        If the noise is none.
     """
-    root = np.linalg.cholesky(noise)
+    try:
+        root = np.linalg.cholesky(noise)
+    except np.linalg.LinAlgError as error:
+        raise InputError("readings", "they, or those of the calibration, have no noise to compare "
+                         "a change with", "use measured ones") from error
     white = solve_triangular(root, design, lower=True)
     normal = white.T @ white
     size = np.trace(normal) / len(normal)
