@@ -28,12 +28,14 @@ def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False) -> 
         Whether the interpolation is a cubic spline.
     """
     over_two, over_four = (_squares(values, u, _LINEAR, pitches) for pitches in (1, 2))
+    if not len(over_two):
+        return 0.0, 0.0
     coarse = float(over_four.mean()) if len(over_four) else 0.0
     shrunk = np.clip(over_two.mean() / coarse, _SMOOTH**2, 1.0) if coarse > 0 else _SMOOTH**2
     if cubic and len(values) > 2 * max(_CUBIC):
         over_two, shrunk = _squares(values, u, _CUBIC, 1), shrunk**2
-    if not len(over_two):
-        return 0.0, 0.0
+        if not len(over_two):
+            return 0.0, 0.0
     mean, largest = np.sqrt(shrunk * np.maximum([over_two.mean(), over_two.max()], 0.0))
     return float(mean), float(largest)
 

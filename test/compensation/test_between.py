@@ -86,6 +86,8 @@ def test_unknown_nodes_are_left_out():
     values[4] = np.nan
     assert error_halfway(values, 0 * values) == pytest.approx((0.25, 0.25))
     assert error_halfway(np.full(9, np.nan), np.zeros(9)) == (0.0, 0.0)
+    every_second = np.where(np.arange(9) % 2, np.nan, np.arange(9.0) ** 2)
+    assert error_halfway(every_second, np.zeros(9)) == (0.0, 0.0)
 
 
 def test_the_mean_square_is_that_of_the_parabola_over_a_cell():
