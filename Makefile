@@ -25,8 +25,10 @@ ament-lint: build/linters/.clean  # what ament_flake8 and ament_pep257 check, wi
 # three workers on two cores: as a rule one waits for a message
 build/oracles/.complete: tools/oracle-requirements.txt | setup
 	@mkdir -p build/oracles; $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes \
-		--upgrade --target build/oracles -r $< && touch $@ || echo "test: GTC is left out: it cannot be installed"
-test: lint ament-lint build/oracles/.complete
+		--upgrade --target build/oracles -r $< && touch $@ || echo "test: GTC and lxml are left out: they cannot be installed"
+build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
+	@$(BIN)/python $< $(@D) || true
+test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd
 	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \
