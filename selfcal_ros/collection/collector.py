@@ -16,8 +16,8 @@ from selfcal_ros.collection.diagnosis import DetectionsSeen, EncoderFacts, Rejec
 from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, n_read_enough
 from selfcal_ros.collection.exposures import Exposures, Tracks
-from selfcal_ros.collection.marks.check_stops import count_stops
 from selfcal_ros.collection.marks.identify import IdentityRules
+from selfcal_ros.collection.marks.stops import count_stops
 from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.settings.nodes import CollectorSettings

@@ -13,8 +13,8 @@ import numpy as np
 
 from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import REMEDY, Kind, Reason
-from selfcal_ros.collection.marks.cells import places_of_cells
 from selfcal_ros.collection.marks.identify import IdentityRules
+from selfcal_ros.collection.marks.stops import places_of_cells
 from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.marks.cells import beside, marks_shown
-from selfcal_ros.collection.marks.check_stops import count_stops
+from selfcal_ros.collection.marks.stops import beside, count_stops, marks_shown
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.view import View

@@ -14,10 +14,10 @@ import numpy as np
 from selfcal_ros.collection.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.exposures import Exposures, JointAt
 from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
-from selfcal_ros.collection.marks import cells, identify
-from selfcal_ros.collection.marks.check_stops import without_aside
+from selfcal_ros.collection.marks import identify, stops
 from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
 from selfcal_ros.collection.marks.rigid import Rigid
+from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import RejectedPlaces, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
@@ -241,7 +241,7 @@ def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndar
     plate = 0j if named.any() else displacement(
         artifact, view, found.rigid, _reading(rules.sense, position, offset))
     tried = _identified_at(artifact, view, d, position, rules, plate=plate,
-                           shift=cells.shift_of(view, offset, away))
+                           shift=stops.shift_of(view, offset, away))
     return tried if plate or _found(tried[0]) > _found(found) else (found, number)
 
 
@@ -259,7 +259,7 @@ def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.nda
     pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
     on_plate = np.rint(np.stack(pose.turned_back(*(rigid.undo(centred) / pitch))))
-    beside = (cells.middle_of(row, side) for row, side in zip(
+    beside = (stops.middle_of(row, side) for row, side in zip(
         on_plate, artifact.shape, strict=True))
     x, y = pose.turned(*(np.array([float(number)]) for number in beside))
     return complex(x[0], y[0])
@@ -270,8 +270,8 @@ def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.n
                    ) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
     offset = np.stack([d["ox"], d["oy"]])
-    number = cells.numbers_of(view, cells.cells_of(view, offset, shift))
-    beside = cells.places_of_cells(view, offset, shift)
+    number = stops.numbers_of(view, stops.cells_of(view, offset, shift))
+    beside = stops.places_of_cells(view, offset, shift)
     away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m
     found = identify.identify_grid(
         artifact, view, _reading(rules.sense, position, offset) - away,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.laser import profiles
 from selfcal_ros.laser.data import AXES, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.noise import linear_noise, reading_noise

@@ -34,10 +34,10 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.summary import sections
-from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     aligned_numbers,
+    camera_facts,
     fixed_column,
     printable,
     significant,

@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.between import Run, mean_of
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact

@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros import __version__
 from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, Provenance, Remedy, Verdict
 from selfcal_ros.reporting.chapters import MAX_ROWS, convention_section, extra_sections, heading

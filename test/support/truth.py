@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.collection.marks.check_stops import without_aside
 from selfcal_ros.collection.marks.repeats import repeat_motion
+from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.papers import readings as white

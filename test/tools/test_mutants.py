@@ -91,8 +91,8 @@ def test_what_changes_elsewhere_leaves_the_sample_as_it_was(tmp_path):
 
 
 def test_the_tests_that_mirror_a_module_run_first_and_each_runs_once():
-    groups = mutants.tests_for("selfcal_ros/estimation/joint/noise.py")
-    assert groups[0] == ["test/estimation/joint/test_noise.py"]
+    groups = mutants.tests_for("selfcal_ros/estimation/joint/problem.py")
+    assert groups[0] == ["test/estimation/joint/test_problem.py"]
     assert "test/estimation/joint/test_statistics.py" in groups[1]  # imports the module
     assert "test/estimation/joint/test_recovery.py" in groups[2]  # stands beside it
     named = [name for group in groups for name in group]
@@ -101,17 +101,17 @@ def test_the_tests_that_mirror_a_module_run_first_and_each_runs_once():
 
 
 def test_near_tests_mirror_or_import_the_module_or_stand_in_its_folder():
-    path = "selfcal_ros/estimation/joint/noise.py"
+    path = "selfcal_ros/estimation/joint/problem.py"
     assert mutants.tests_for(path, near=True) == mutants.tests_for(path)[:2]
     alone = "selfcal_ros/collection/approach.py"
     assert "test/collection/test_approach.py" in mutants.tests_for(alone, near=True)[0]
 
 
 def test_the_users_of_a_module_are_those_that_import_it_over_some_steps():
-    near = mutants.users_of("selfcal_ros/estimation/joint/noise.py", 1)
-    assert "test/estimation/joint/test_noise.py" in near
-    assert set(near) < set(mutants.users_of("selfcal_ros/estimation/joint/noise.py", 3))
-    far = mutants.users_of("selfcal_ros/estimation/joint/noise.py", 99)
+    near = mutants.users_of("selfcal_ros/estimation/joint/problem.py", 1)
+    assert "test/estimation/joint/test_problem.py" in near
+    assert set(near) < set(mutants.users_of("selfcal_ros/estimation/joint/problem.py", 3))
+    far = mutants.users_of("selfcal_ros/estimation/joint/problem.py", 99)
     assert "test/model/test_visit_order.py" not in far
 
 

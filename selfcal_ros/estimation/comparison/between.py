@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.comparison.maps import Significance, significance
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.error_map import MANY_DOF
 
 INDEPENDENT = 1e-6

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import require_same_lattice
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.verdict.uncertainty import (

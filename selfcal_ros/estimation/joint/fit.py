@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.datum.covariance import scale_of, scale_of_plate
-from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
     AngularPart,
     FreeNetworkSolution,
+    NoiseEstimate,
     Problem,
     grid_noise,
+    noise_estimate,
     sigma_of,
     weight_ratio,
 )

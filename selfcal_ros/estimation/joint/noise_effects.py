@@ -15,8 +15,7 @@ from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.noise import F_LEVEL, MIN_REPEAT_DOF, SAME
-from selfcal_ros.estimation.joint.problem import FLOOR, noise_excess
+from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 ADDED = "first_order_added"

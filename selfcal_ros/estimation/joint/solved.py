@@ -16,7 +16,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.noise import NoiseEstimate
+from selfcal_ros.estimation.joint.problem import NoiseEstimate
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense

@@ -7,8 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.joint.noise import NoiseEstimate, noise_estimate, pooled
-from selfcal_ros.estimation.joint.problem import FLOOR
+from selfcal_ros.estimation.joint.problem import FLOOR, NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.solved import Solved, noise_of
 from selfcal_ros.estimation.law.equations import HuLaw, HuReadings, HuSolution
 from selfcal_ros.estimation.multifrontal.factor import one_thread

@@ -10,15 +10,17 @@ from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.joint.noise import (
+from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
+    Problem,
     coverage_factor,
     noise_estimate,
+    repeats_of,
+    turned,
 )
-from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
 from selfcal_ros.estimation.joint.solve import weights_read
 from selfcal_ros.estimation.joint.solved import noise_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge

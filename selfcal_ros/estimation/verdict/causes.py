@@ -11,8 +11,7 @@ import numpy as np
 from scipy.special import eval_legendre, fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.joint.noise import pooled
-from selfcal_ros.estimation.joint.problem import FLOOR, Problem
+from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import TermInputs

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.compensation.between import CELL_MEAN, error_halfway
-from selfcal_ros.estimation.joint.noise import F_LEVEL, coverage_factor
+from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
     KEY,

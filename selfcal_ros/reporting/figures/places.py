@@ -16,8 +16,7 @@ from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
 from selfcal_ros.reporting.figures.residuals import places_mm
-from selfcal_ros.reporting.summary.camera import cells_of, yaw_of
-from selfcal_ros.reporting.summary.numbers import printable, significant
+from selfcal_ros.reporting.summary.numbers import cells_of, printable, significant, yaw_of
 from selfcal_ros.reporting.summary.sections import pose_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 

@@ -14,13 +14,13 @@ from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import PRIOR, CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.reporting.summary.camera import camera_facts
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     MapFigures,
     aligned,
     aligned_numbers,
     arcsec,
+    camera_facts,
     counted,
     decimals_for,
     fixed,

@@ -13,7 +13,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.between import Run, mean_of, variance_between
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes

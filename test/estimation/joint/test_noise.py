@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import binom
 from scipy.stats import f as f_distribution
 
-from selfcal_ros.estimation.joint.noise import F_LEVEL, noise_estimate
+from selfcal_ros.estimation.joint.problem import F_LEVEL, noise_estimate
 
 NAN = float("nan")
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.noise import coverage_factor
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

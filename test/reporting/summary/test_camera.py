@@ -11,8 +11,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw
-from selfcal_ros.reporting.summary.camera import camera_facts, cells_of, yaw_facts
-from selfcal_ros.reporting.summary.numbers import significant
+from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of, significant, yaw_facts
 from selfcal_ros.reporting.summary.sections import summary_text, terms_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings

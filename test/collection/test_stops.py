@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.collection.collector import view_progress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
-from selfcal_ros.collection.marks.check_stops import stage_aside, without_aside
+from selfcal_ros.collection.marks.stops import stage_aside, without_aside
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
