@@ -6,12 +6,17 @@ import csv
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import stat
-from collections.abc import Iterable
+from dataclasses import MISSING, fields, is_dataclass
+from enum import StrEnum
+from functools import cache
+from numbers import Integral
 from pathlib import Path
-from typing import Any, ClassVar
+from types import UnionType
+from typing import Any, ClassVar, Literal, cast, get_args, get_origin, get_type_hints
 
 import yaml
 from yaml.composer import Composer
@@ -19,7 +24,7 @@ from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
 from selfcal_ros.errors import InputError, first_line, known_are
-from selfcal_ros.outputs import atomic_file
+from selfcal_ros.outputs import write_text
 
 MAX_YAML_BYTES = 4 << 20
 MAX_YAML_NODES = 50_000
@@ -141,82 +146,8 @@ for _class in (*LOADERS, YamlDumper):
     _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
-def sync_folder(folder: Path) -> None:
-    """Synchronise a folder's entries to the disk."""
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
 def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or first_line(error)
-
-
-def check_outputs(inputs: Iterable[str | os.PathLike | None],
-                  outputs: Iterable[str | os.PathLike | None]) -> None:
-    """Refuse outputs that cannot all be written, before writing the first.
-
-    Raises
-    ------
-    InputError
-        If an output is an input file (or in an input folder), two outputs are
-        the same file, or an output is a folder or has no folder.
-    """
-    taken = {os.path.realpath(name) for name in inputs if name}
-    taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
-              for file in folder.iterdir()}
-    for name in outputs:
-        if not name:
-            continue
-        target = Path(os.path.realpath(name))
-        if target.exists() and not target.is_file() and not target.is_dir():
-            continue  # a pipe or /dev/null accepts any number of outputs
-        if target.is_dir():
-            raise InputError(str(name), "it is a folder", "name a file")
-        if str(target) in taken:
-            raise InputError(str(name), "would be written over", "name another output file")
-        if not target.parent.is_dir():
-            raise InputError(str(name), "cannot be written (No such file or directory)",
-                             "name an existing, writable folder")
-        taken.add(str(target))
-
-
-def write_bytes(path: str | os.PathLike, data: bytes) -> None:
-    """Write `data` to `path` atomically."""
-    with atomic_file(path) as file:
-        file.write(data)
-
-
-def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write `text` as UTF-8 to `path` atomically."""
-    write_bytes(path, text.encode(errors="backslashreplace"))  # file names may not be UTF-8
-
-
-def write_json(path: str | os.PathLike, value: Any) -> None:
-    """Write `value` as strict JSON (no NaN) to `path` atomically."""
-    write_text(path, json_text(value) + "\n")
-
-
-def json_text(value: Any, depth: int = 0) -> str:
-    """Return strict JSON (no NaN), a key or row on a line: lists of numbers are not broken."""
-    inner, ends = [], "[]"
-    if isinstance(value, dict):
-        ends, inner = "{}", [f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
-                             for key, item in value.items()]
-    elif isinstance(value, list | tuple) and any(
-            isinstance(item, dict | list | tuple) for item in value):
-        inner = [json_text(item, depth + 1) for item in value]
-    if not inner:
-        return json.dumps(value, allow_nan=False)
-    line = "\n" + " " * depth
-    return f"{ends[0]}{line} {f',{line} '.join(inner)}{line}{ends[1]}"
-
-
-def write_yaml(path: str | os.PathLike, value: Any) -> None:
-    """Write `value` as YAML, keys in their order, to `path` atomically."""
-    write_text(path, yaml.dump(value, Dumper=YamlDumper, sort_keys=False))
 
 
 def read_bytes(path: str | os.PathLike, limit: int | None = None) -> bytes:
@@ -391,3 +322,44 @@ def checked_fields(data: object, where: str, required: dict,
                              "correct the value")
         out[key] = value
     return out
+
+
+_hints = cache(get_type_hints)
+
+
+def read(kind: Any, value: Any) -> Any:
+    """Return a value from JSON as `kind`: a dataclass, a tuple of one kind, or a plain type.
+
+    Null is NaN for a float. Keys that a dataclass has no field for are ignored.
+
+    Raises
+    ------
+    ValueError, KeyError
+        For a value of another type, and for a missing key whose field has no default.
+    """
+    inner = get_args(kind)
+    if is_dataclass(kind):
+        data, make = read(dict, value), cast(Any, kind)
+        needed = [item.name for item in fields(kind) if item.name in data or (
+            item.default is MISSING and item.default_factory is MISSING)]
+        return make(**{name: read(_hints(make)[name], data[name]) for name in needed})
+    if get_origin(kind) is tuple:
+        return tuple(read(inner[0], item) for item in read(list, value))
+    if get_origin(kind) is UnionType:  # of a kind and None
+        return None if value is None else read(inner[0], value)
+    if kind is float:
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise ValueError(f"{value!r} is not a number")
+        return math.nan if value is None else float(value)
+    kind = str if get_origin(kind) is Literal else get_origin(kind) or kind
+    if issubclass(kind, StrEnum):
+        return kind(value)
+    wanted = Integral if kind is int else kind
+    if not isinstance(value, wanted) or (kind is int and isinstance(value, bool)):
+        raise ValueError(f"{value!r} is not of type {kind.__name__}")
+    return value
+
+
+def write_yaml(path: str | os.PathLike, value: Any) -> None:
+    """Write `value` as YAML, keys in their order, to `path` atomically."""
+    write_text(path, yaml.dump(value, Dumper=YamlDumper, sort_keys=False))

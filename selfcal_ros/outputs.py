@@ -3,15 +3,20 @@
 
 import contextlib
 import fcntl
+import json
+import math
 import os
 import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from selfcal_ros.errors import InputError, first_line
 
@@ -116,3 +121,90 @@ def _mode(target: Path) -> int:
     umask = os.umask(0)
     os.umask(umask)
     return 0o666 & ~umask
+
+
+def sync_folder(folder: Path) -> None:
+    """Synchronise a folder's entries to the disk."""
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def check_outputs(inputs: Iterable[str | os.PathLike | None],
+                  outputs: Iterable[str | os.PathLike | None]) -> None:
+    """Refuse outputs that cannot all be written, before writing the first.
+
+    Raises
+    ------
+    InputError
+        If an output is an input file (or in an input folder), two outputs are
+        the same file, or an output is a folder or has no folder.
+    """
+    taken = {os.path.realpath(name) for name in inputs if name}
+    taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
+              for file in folder.iterdir()}
+    for name in outputs:
+        if not name:
+            continue
+        target = Path(os.path.realpath(name))
+        if target.exists() and not target.is_file() and not target.is_dir():
+            continue  # a pipe or /dev/null accepts any number of outputs
+        if target.is_dir():
+            raise InputError(str(name), "it is a folder", "name a file")
+        if str(target) in taken:
+            raise InputError(str(name), "would be written over", "name another output file")
+        if not target.parent.is_dir():
+            raise InputError(str(name), "cannot be written (No such file or directory)",
+                             "name an existing, writable folder")
+        taken.add(str(target))
+
+
+def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+    """Write `data` to `path` atomically."""
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write `text` as UTF-8 to `path` atomically."""
+    write_bytes(path, text.encode(errors="backslashreplace"))  # file names may not be UTF-8
+
+
+def write_json(path: str | os.PathLike, value: Any) -> None:
+    """Write `value` as strict JSON (no NaN) to `path` atomically."""
+    write_text(path, json_text(value) + "\n")
+
+
+def json_text(value: Any, depth: int = 0) -> str:
+    """Return strict JSON (no NaN), a key or row on a line: lists of numbers are not broken."""
+    inner, ends = [], "[]"
+    if isinstance(value, dict):
+        ends, inner = "{}", [f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
+                             for key, item in value.items()]
+    elif isinstance(value, list | tuple) and any(
+            isinstance(item, dict | list | tuple) for item in value):
+        inner = [json_text(item, depth + 1) for item in value]
+    if not inner:
+        return json.dumps(value, allow_nan=False)
+    line = "\n" + " " * depth
+    return f"{ends[0]}{line} {f',{line} '.join(inner)}{line}{ends[1]}"
+
+
+def plain(value: Any) -> Any:
+    """Return `value` as JSON types: arrays as lists, NaN and infinities as None."""
+    if isinstance(value, np.generic):  # first, as a float64 is a float
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        whole = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
+        return value.tolist() if whole else plain(value.tolist())
+    return value

@@ -15,9 +15,9 @@ from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import random_map, result_of
 from test.support.placed import SIX, plate, readings, rows

@@ -19,20 +19,17 @@ from hypothesis import strategies as st
 
 from selfcal_ros import files
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import (
+from selfcal_ros.files import read_bytes, read_json, read_text, read_yaml, sha256_of, write_yaml
+from selfcal_ros.outputs import (
+    atomic_file,
     check_outputs,
     json_text,
-    read_bytes,
-    read_json,
-    read_text,
-    read_yaml,
-    sha256_of,
+    sweep,
+    temporary_folder,
     write_bytes,
     write_json,
     write_text,
-    write_yaml,
 )
-from selfcal_ros.outputs import atomic_file, sweep, temporary_folder
 
 ROOT = Path(__file__).parents[1]
 

@@ -29,7 +29,8 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_json, write_yaml
+from selfcal_ros.files import write_yaml
+from selfcal_ros.outputs import write_json
 from selfcal_ros.parallel import check_workers, mapped
 from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation

@@ -20,7 +20,7 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import write_text
+from selfcal_ros.outputs import write_text
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation

@@ -14,9 +14,9 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import write_text
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
+from selfcal_ros.outputs import write_text
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.places import plan_figure
 from selfcal_ros.reporting.report import chapters, svg_file

@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from selfcal_ros import __version__
-from selfcal_ros.files import write_json
+from selfcal_ros.outputs import write_json
 
 ROOT = Path(__file__).parents[1]
 STATED = {"empy": "LGPL-2.1-or-later", "ros-fastcdr": "Apache-2.0", "ros-fastrtps": "Apache-2.0",

@@ -14,7 +14,8 @@ from selfcal_ros.aerotech.model import CalFile, CalFindings, Table, Table1D, Uni
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.rules import check_tables
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_bytes, write_bytes
+from selfcal_ros.files import read_bytes
+from selfcal_ros.outputs import write_bytes
 
 
 def decimal(value: float) -> str:

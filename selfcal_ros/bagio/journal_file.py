@@ -20,7 +20,7 @@ from mcap.records import Channel, Footer, Header, McapRecord, Schema, Statistics
 from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC, Block, message_block, stretch
 from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
 from selfcal_ros.bagio.writer import FileEntry
-from selfcal_ros.files import sync_folder
+from selfcal_ros.outputs import sync_folder
 
 MESSAGE = struct.Struct("<BQHIQQ")
 """A message record before its payload."""

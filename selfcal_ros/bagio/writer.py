@@ -19,9 +19,8 @@ from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio.schemas import build, definition_of, hash_of, store_with
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_text
 from selfcal_ros.messages.from_model import Fields
-from selfcal_ros.outputs import temporary_folder
+from selfcal_ros.outputs import temporary_folder, write_text
 
 CHUNK_SIZE = 256 * 1024
 UNKNOWN_HASH = "unknown"

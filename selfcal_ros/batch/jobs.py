@@ -19,10 +19,10 @@ from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u
-from selfcal_ros.files import write_json
 from selfcal_ros.model import result as results
-from selfcal_ros.model.json_form import finding_to_dict, plain
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.verdict import finding_to_dict
+from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M

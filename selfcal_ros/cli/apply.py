@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.apply import load
     from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.cli.trace import outputs_of, record
-    from selfcal_ros.files import check_outputs, read_text, write_text
+    from selfcal_ros.files import read_text
+    from selfcal_ros.outputs import check_outputs, write_text
 
     check_outputs([args.result, args.points], outputs_of(args))
     stage = load(args.result, method=args.method, outside=args.outside)

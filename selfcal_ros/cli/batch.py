@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.dask:  # first: the modules of the workers load in parallel
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
     from selfcal_ros.batch.folder import Settings, done_and_to_do, find_bags, kept_records, opened
-    from selfcal_ros.files import write_json, write_text
+    from selfcal_ros.outputs import write_json, write_text
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",

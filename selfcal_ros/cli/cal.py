@@ -194,7 +194,7 @@ def _export(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.trace import command, record, records_of
     from selfcal_ros.compensation.export import provenance
     from selfcal_ros.compensation.residual import combined
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.outputs import check_outputs
 
     frame = cal_lines.frame_of(args)
     if args.theta_output and frame.theta_axis is None:
@@ -301,7 +301,7 @@ def _verify(args: argparse.Namespace) -> int:
 
 def figures_of(residuals: "list[Residual]") -> dict:
     """Return the residuals as data, m and rad."""
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     return plain({r.place: {"points": r.position.shape[1],
                             "before": {"rms": r.rms("before"), "max": r.largest("before")},

@@ -288,7 +288,7 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.cli.trace import command, outputs_of, record
     from selfcal_ros.compensation.export import origin_lines, verdict_lines
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.outputs import check_outputs
 
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",

@@ -27,7 +27,8 @@ def run(args: argparse.Namespace) -> int:
     """Read result and details, write the certificate."""
     from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.cli.trace import outputs_of, record
-    from selfcal_ros.files import check_outputs, read_yaml, write_bytes
+    from selfcal_ros.files import read_yaml
+    from selfcal_ros.outputs import check_outputs, write_bytes
     from selfcal_ros.results import read_result
     from selfcal_ros.standards.dcc import certificate, is_traceable
     from selfcal_ros.standards.details import details_from_dict

@@ -35,8 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Combine, write the mean map, print the deviation of each run."""
     from selfcal_ros.estimation.comparison.combine import combine
-    from selfcal_ros.files import check_outputs, write_json
     from selfcal_ros.model.result import created_now, result_to_dict
+    from selfcal_ros.outputs import check_outputs, write_json
     from selfcal_ros.reporting.words.findings import worded
 
     check_outputs(args.maps, [file_of(args)])

@@ -69,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
     from selfcal_ros.bagio.images import ImageBag
     from selfcal_ros.bagio.offline import TRUTH_FILE
-    from selfcal_ros.files import read_bytes, write_bytes
+    from selfcal_ros.files import read_bytes
+    from selfcal_ros.outputs import write_bytes
     from selfcal_ros.vision.exposures import ImageDetector
 
     settings = settings_of(args)

@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.terminal import say_unless_qualified
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
-    from selfcal_ros.files import check_outputs, parse_json
+    from selfcal_ros.files import parse_json
+    from selfcal_ros.outputs import check_outputs
     from selfcal_ros.results import read_result, result_bytes
 
     check_outputs([args.a, args.b], [args.plot])
@@ -88,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
     """Return grade and enlargements of the results A and B."""
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     named = dict(zip("ab", (result.verdict for result in results), strict=False))
     return plain({"grade": {name: str(verdict.grade) for name, verdict in named.items()},
@@ -107,7 +108,7 @@ def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
 def _json(found: MapDifference) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     return plain({
         "significant": found.significant,
@@ -171,7 +172,7 @@ def _verdict_text(found: MapDifference) -> str:
 
 
 def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
                              "difference": row.difference, "u": row.u, "p": row.p}

@@ -29,7 +29,8 @@ def run(args: argparse.Namespace) -> int:
     """Add files to the bag, or list or extract those that it has."""
     from selfcal_ros.bagio.attachments import attach, attached
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import check_outputs, read_bytes, write_bytes
+    from selfcal_ros.files import read_bytes
+    from selfcal_ros.outputs import check_outputs, write_bytes
 
     if args.files and args.extract:
         raise InputError("--extract", "files are named, too", "embed first, then extract")

@@ -47,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.trace import command, record, records_of
     from selfcal_ros.controllers.export import export, loaded
     from selfcal_ros.controllers.grid import Source
-    from selfcal_ros.files import check_outputs, read_text
+    from selfcal_ros.files import read_text
+    from selfcal_ros.outputs import check_outputs
 
     wiring = _wiring(args)
     result, filled = ready(args)

@@ -37,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
     from selfcal_ros.controllers.grid import Wiring, wanted
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import check_outputs, read_text, write_text
+    from selfcal_ros.files import read_text
+    from selfcal_ros.outputs import check_outputs, write_text
     from selfcal_ros.units import M_PER_UM
 
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:

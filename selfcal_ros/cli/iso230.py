@@ -96,7 +96,7 @@ def _figures(found: AxisFigures | PathFigures) -> dict[str, Any]:
 
 
 def _json(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) -> dict[str, Any]:
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     return plain({
         "axes": [{"axis": item.axis, "line": item.line_m, "positions": item.position_m,

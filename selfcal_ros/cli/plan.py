@@ -158,7 +158,7 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
 
 def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,
                 maps: bool) -> dict[str, Any]:
-    from selfcal_ros.model.json_form import plain
+    from selfcal_ros.outputs import plain
 
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,
@@ -260,9 +260,10 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
-    from selfcal_ros.files import check_outputs, write_yaml
+    from selfcal_ros.files import write_yaml
     from selfcal_ros.model.error_map import ThetaDatum
     from selfcal_ros.model.view import plan_to_dict
+    from selfcal_ros.outputs import check_outputs
     from selfcal_ros.reporting.words.tables import search_text
 
     if args.top is not None and args.views is not None:

@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
 
     from selfcal_ros.cli.report import read_truth
     from selfcal_ros.errors import ExitCode
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.outputs import check_outputs
     from selfcal_ros.reporting.figures.maps import map_picture
     from selfcal_ros.reporting.figures.paper import save_picture
     from selfcal_ros.results import read_result

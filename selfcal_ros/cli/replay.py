@@ -40,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.bagio.offline import bag_input
     from selfcal_ros.cli.terminal import exit_code, show
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import check_outputs, read_json, write_json
+    from selfcal_ros.files import read_json
     from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
-    from selfcal_ros.outputs import temporary_folder
+    from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:

@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
     from selfcal_ros.aerotech.verify import table_chapter
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.outputs import check_outputs
     from selfcal_ros.reporting.chapters import ABOUT
     from selfcal_ros.reporting.report import check_name, write_report
     from selfcal_ros.reporting.summary.numbers import can_print_symbols

@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the simulation, print and save the requested output."""
     from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.files import write_text
+    from selfcal_ros.outputs import write_text
     from selfcal_ros.parallel import check_workers
 
     if args.draws < 1:

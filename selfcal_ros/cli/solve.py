@@ -149,13 +149,13 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.collection.inputs import advice
     from selfcal_ros.collection.settings.estimator import solver_options
     from selfcal_ros.errors import NotIdentifiableError
-    from selfcal_ros.files import check_outputs
     from selfcal_ros.model.result import (
         created_now,
         result_to_dict,
         unidentified_result,
         with_input,
     )
+    from selfcal_ros.outputs import check_outputs
     from selfcal_ros.reporting.words.findings import worded
 
     check_outputs([args.bag, args.params], [file_of(args), args.report])
@@ -234,7 +234,7 @@ def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> An
 
 def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
     """Write a result to a file, to stdout, or both."""
-    from selfcal_ros.files import write_json
+    from selfcal_ros.outputs import write_json
 
     if file_of(args):
         write_json(args.output, data)
@@ -278,7 +278,8 @@ def _since(result: Any) -> list[str]:
 def _budget(result: Any) -> list[str]:
     """Return the budget as it is printed."""
     from selfcal_ros.estimation.verdict.uncertainty import budgets
-    from selfcal_ros.reporting.words.tables import budget_text, excluded_text
+    from selfcal_ros.reporting.words.phrases import excluded_text
+    from selfcal_ros.reporting.words.tables import budget_text
 
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]

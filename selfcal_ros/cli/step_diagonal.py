@@ -69,11 +69,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify the errors, write the result, and print a summary."""
-    from selfcal_ros.files import write_json
     from selfcal_ros.laser.data import Form, Method
     from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
     from selfcal_ros.laser.profiles import ReferenceLine
     from selfcal_ros.laser.report import outcome, summary
+    from selfcal_ros.outputs import write_json
 
     _check_outputs(args)
     if args.simulate:
@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
 def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written."""
     from selfcal_ros.aerotech.write import refuse_existing
-    from selfcal_ros.files import check_outputs
+    from selfcal_ros.outputs import check_outputs
 
     measured = not args.simulate
     for option, path, there, remedy in (
@@ -167,10 +167,11 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
 
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
-    from selfcal_ros.files import read_yaml, write_json, write_text
+    from selfcal_ros.files import read_yaml
     from selfcal_ros.laser.report import truth_of
     from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
     from selfcal_ros.laser.table import table_text
+    from selfcal_ros.outputs import write_json, write_text
 
     if args.data is not None:
         raise InputError("arguments", "--simulate makes data and reads none",

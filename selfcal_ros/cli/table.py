@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from selfcal_ros.cli.terminal import exit_code
     from selfcal_ros.cli.trace import outputs_of, record
     from selfcal_ros.errors import InputError
-    from selfcal_ros.files import check_outputs, write_bytes
+    from selfcal_ros.outputs import check_outputs, write_bytes
     from selfcal_ros.results import read_result
 
     kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()

@@ -40,7 +40,7 @@ def tell(text: str) -> None:
 
 def put(data: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
-    from selfcal_ros.files import json_text
+    from selfcal_ros.outputs import json_text
 
     print(json_text(data))
 

@@ -47,7 +47,8 @@ def record(args: argparse.Namespace, result: "CalibrationResult",
            paths: Iterable[str | os.PathLike]) -> None:
     """Write the record of each exported file; none of a pipe or a device."""
     from selfcal_ros import __version__
-    from selfcal_ros.files import sha256_of, write_json
+    from selfcal_ros.files import sha256_of
+    from selfcal_ros.outputs import write_json
 
     source, digest = result.read_from or ("", "")
     for path in map(Path, paths):

@@ -21,8 +21,7 @@ from selfcal_ros.collection.marks.stops import count_stops
 from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.timeline import Timeline, build_timeline, without_strays
-from selfcal_ros.collection.view_cache import ViewCache
+from selfcal_ros.collection.timeline import Timeline, ViewCache, build_timeline, without_strays
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.topics import COMMAND_TOPIC

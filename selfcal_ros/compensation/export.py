@@ -12,9 +12,8 @@ from selfcal_ros import __version__
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, rms
-from selfcal_ros.model.json_form import reference_name
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Grade
+from selfcal_ros.model.verdict import Grade, reference_name
 from selfcal_ros.units import UM_PER_M
 
 

@@ -65,9 +65,10 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     result = judged(solved, measurements, options)
     if not result.verdict.qualified:
         check_placing(measurements)
-    yaw = None if solved.model is None else yaw_of(solved.model, measurements.sense)
     shown = {} if camera is None else camera.to_dict()
-    shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
+    if solved.model is not None and measurements.has_images:
+        yaw = yaw_of(solved.model, measurements.sense)
+        shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
     result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
     if not options.prior:
         return result
@@ -79,7 +80,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 
 def _check_images(measurements: Measurements, options: Options) -> None:
     """Refuse images of several marks where their common noise would be missing in U."""
-    if not any(view.view.cell for view in measurements.views):
+    if not measurements.has_images:
         return
     if options.plate is not None:
         raise InputError(f"plan '{measurements.plan_id}'", "images of several marks do not serve "
@@ -93,7 +94,7 @@ def _check_images(measurements: Measurements, options: Options) -> None:
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
     """Return the camera that images of several marks show, and the readings freed from it."""
     straight, camera = measurements, None
-    if options.method == "law" or not any(view.view.cell for view in measurements.views):
+    if options.method == "law" or not measurements.has_images:
         return None, measurements
     plain = replace(options, terms=(), assumed=tuple(
         term for term in options.model_terms(visits=True) if term.name is TermName.YAW))

@@ -11,7 +11,7 @@ from selfcal_ros.laser import profiles
 from selfcal_ros.laser.data import AXES, Closure, Method, StepDiagonal, StepDiagonalResult
 from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.simulation import StepMachine
-from selfcal_ros.model.json_form import plain
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, titled
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, UM_PER_MM

@@ -232,6 +232,11 @@ class Measurements:
     model_terms: tuple[str, ...] = ()
     artifact_from: str = ""
 
+    @property
+    def has_images(self) -> bool:
+        """Whether any reading is of an image of several marks."""
+        return any(view.view.cell is not None for view in self.views)
+
     def all_rejected(self) -> dict[str, int]:
         """Return reason -> count over all views and outside them, sorted by reason."""
         total: dict[str, int] = {}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.model import json_form
+from selfcal_ros.files import read
 from selfcal_ros.model.artifact import (
     Artifact,
     artifact_of,
@@ -19,9 +19,24 @@ from selfcal_ros.model.artifact import (
     map_to_dict,
 )
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.json_form import plain, read
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, Provenance, Verdict
+from selfcal_ros.model.verdict import (
+    BudgetLine,
+    Finding,
+    Grade,
+    ModelResult,
+    Provenance,
+    Verdict,
+    budget_from_list,
+    finding_to_dict,
+    findings_from_list,
+    line_to_dict,
+    provenance_from_dict,
+    reference_from_dict,
+    verdict_from_dict,
+    verdict_to_dict,
+)
+from selfcal_ros.outputs import plain
 
 SCHEMA = "selfcal.result/1"
 COMBINED = "combined"
@@ -227,8 +242,7 @@ def unidentified_result(measurements: Measurements, observability: Observability
     """Return the result of a plan that does not identify the stage, with unknown maps."""
     artifact = measurements.artifact
     grid, circle = np.full(artifact.field.shape, np.nan), np.full(artifact.angular_count, np.nan)
-    plate = np.full(artifact.shape, np.nan)
-    nan = float("nan")
+    plate, nan = np.full(artifact.shape, np.nan), math.nan
     views = tuple(ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m, nan, nan, nan,
                              v.used, sum(v.rejected.values())) for v in measurements.views)
     return CalibrationResult(
@@ -261,7 +275,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                         for key in ("magnification", "u_magnification")}},
         **({"map": own} if (own := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
-        "verdict": plain(json_form.verdict_to_dict(result.verdict)),
+        "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(result.model),
         "reference": result.reference,
         "provenance": plain({"created": made.created, "duration_s": made.duration_s,
@@ -284,9 +298,9 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "noise": plain(result.noise),
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
-        "findings": plain([json_form.finding_to_dict(found) for found in result.findings]),
-        "budget": plain([json_form.line_to_dict(line) for line in result.budget]),
-        "excluded": plain([json_form.line_to_dict(line) for line in result.excluded]),
+        "findings": plain([finding_to_dict(found) for found in result.findings]),
+        "budget": plain([line_to_dict(line) for line in result.budget]),
+        "excluded": plain([line_to_dict(line) for line in result.excluded]),
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -346,13 +360,13 @@ def _parse(data: dict) -> CalibrationResult:
         read(str, data.get("method", "joint")),
         read(str, data.get("measurement_sense", "microscope_moves")),
         {key: value for key, value in data.items() if key not in _KNOWN},
-        json_form.verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
+        verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
         read(ModelResult, data.get("model") or {}),
-        json_form.reference_from_dict(data.get("reference")),
-        json_form.provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
-        json_form.findings_from_list(Finding, data.get("findings", [])),
-        json_form.budget_from_list(data.get("budget", [])),
-        json_form.budget_from_list(data.get("excluded", [])),
+        reference_from_dict(data.get("reference")),
+        provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
+        findings_from_list(Finding, data.get("findings", [])),
+        budget_from_list(data.get("budget", [])),
+        budget_from_list(data.get("excluded", [])),
         artifact if artifact.map_grid else None)
 
 

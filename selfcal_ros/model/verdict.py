@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal
 
+from selfcal_ros.files import read
+
 
 @dataclass(frozen=True)
 class Remedy:
@@ -237,3 +239,100 @@ class Provenance:
     duration_s: float = float("nan")
     version: str = ""
     extra: dict[str, Any] = field(default_factory=dict)
+
+
+REFERENCES = ("artifact", "stage_x", "stage_y", "marks")
+"""Kinds of a reference length."""
+
+
+def finding_to_dict(found: Finding) -> dict[str, Any]:
+    """Return the JSON form of a finding, or of a cause.
+
+    Raises
+    ------
+    ValueError
+        If it has no sentence.
+    """
+    if not found.text:
+        raise ValueError(f"the finding '{found.name}' is not worded")
+    data = {**vars(found), "mark": list(found.mark)}
+    if isinstance(found, Cause):
+        data["remedies"] = [{remedy.kind: remedy.value} for remedy in found.remedies]
+    return data
+
+
+def findings_from_list(kind: type, data: Any) -> tuple:
+    """Return findings, or causes; those of older versions have no details."""
+    return tuple(read(kind, {"details": None} | found | {"remedies": [
+        {"kind": name, "value": value} for remedy in found.get("remedies", [])
+        for name, value in remedy.items()]}) for found in read(list, data))
+
+
+def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
+    """Return the JSON form of a verdict; ValueError if it has no sentences."""
+    return {"qualified": verdict.qualified, "grade": str(verdict.grade),
+            "sentence": verdict.sentence, "reasons": list(verdict.reasons),
+            "failed": [finding_to_dict(found) for found in verdict.failed],
+            "causes": [finding_to_dict(cause) for cause in verdict.causes],
+            "enlarged_by": [vars(item) for item in verdict.enlarged_by]}
+
+
+def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
+    """Return the verdict of a result; without one, whether it is identified decides."""
+    if data is None:
+        grade = Grade.GOOD if identifiable else Grade.NOT_QUALIFIED
+        return Verdict(grade, sentence="Not judged: written before there were verdicts")
+    qualified = read(bool, data["qualified"])
+    grade = Grade(data.get("grade", "good" if qualified else "not_qualified"))
+    if qualified is (grade is Grade.NOT_QUALIFIED):
+        raise ValueError(f"the grade '{grade}' contradicts qualified {qualified}")
+    return Verdict(
+        grade, findings_from_list(Finding, data.get("failed", [])),
+        findings_from_list(Cause, data["causes"]),
+        read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
+        read(str, data["sentence"]), read(tuple[str, ...], data["reasons"]))
+
+
+def line_to_dict(line: BudgetLine) -> dict[str, Any]:
+    """Return the JSON form of a line of the budget."""
+    return {"type" if name == "kind" else name: value for name, value in vars(line).items()}
+
+
+def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
+    """Return the lines of a budget; none of those of files that have other columns."""
+    return tuple(
+        read(BudgetLine, row | {"dof": math.inf if row["dof"] is None else row["dof"],
+                                  "kind": row["type"]})
+        for row in read(list, rows) if "effect_rms" in read(dict, row))
+
+
+def provenance_from_dict(data: dict | None) -> Provenance:
+    """Return the provenance of a result, as far as known."""
+    known = ("created", "duration_s", "version")
+    return Provenance() if data is None else read(Provenance, data | {
+        "extra": {key: value for key, value in data.items() if key not in known}})
+
+
+def reference_from_dict(raw: Any) -> dict[str, Any] | None:
+    """Return the reference length of a result; ValueError if invalid."""
+    if raw is None:
+        return None
+    if read(dict, raw)["kind"] not in REFERENCES:
+        raise ValueError(f"the reference {raw['kind']!r} is unknown")
+    error, u = read(float, raw["relative_error"]), read(float, raw["u_relative"])
+    if not (abs(error) < 0.1 and 0 <= u < 0.1):
+        raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
+    read(str, raw.get("certificate") or "")
+    for value in read(dict, raw.get("certified") or {}).values():
+        read(float, value)
+    marks = [read(tuple[int, ...], mark) for mark in read(list, raw.get("marks") or [])]
+    if (raw["kind"] == "marks") != (len(set(marks)) == 2 == len(marks[0]) == len(marks[1])):
+        raise ValueError(f"reference: the marks {marks} do not fit the kind {raw['kind']!r}")
+    return raw
+
+
+def reference_name(reference: dict[str, Any]) -> str:
+    """Return what was certified: the kind of a reference length, or its marks."""
+    if reference["kind"] != "marks":
+        return str(reference["kind"])
+    return "distance of the marks {} and {}".format(*map(tuple, reference["marks"]))

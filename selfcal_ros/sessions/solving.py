@@ -13,10 +13,10 @@ from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import Options, calibrate, pure_noise
-from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
 from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.findings import worded

@@ -14,9 +14,8 @@ from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection import inputs
 from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_json, write_text
 from selfcal_ros.messages import from_model
-from selfcal_ros.model.json_form import plain
+from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.exposing import Exposure
 from selfcal_ros.simulation.machine import Truth

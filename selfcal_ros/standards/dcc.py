@@ -13,11 +13,11 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.model.json_form import reference_name
 from selfcal_ros.model.result import PRIOR, CalibrationResult
+from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.reporting.chapters import convention_section
-from selfcal_ros.reporting.words.phrases import line_text
-from selfcal_ros.reporting.words.tables import dof_text, excluded_text, quantity_text
+from selfcal_ros.reporting.words.phrases import excluded_text, line_text
+from selfcal_ros.reporting.words.tables import dof_text, quantity_text
 from selfcal_ros.standards.details import UNITS
 from selfcal_ros.units import UM_PER_M
 

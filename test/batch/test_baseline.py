@@ -14,9 +14,9 @@ from selfcal_ros.batch.table import csv_text
 from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from test.support.options import bare
 from test.support.sessions import small_bag

@@ -85,8 +85,8 @@ def rival(path: str) -> None:
 def drive(method: str, rate: int, seconds: float) -> dict:
     """Return a row of the bench for one method at one rate."""
     from selfcal_ros.cli.processes import domain
-    from selfcal_ros.files import write_json
     from selfcal_ros.model.result import result_to_dict
+    from selfcal_ros.outputs import write_json
     from test.support.maps import result_of
 
     processors = sorted(os.sched_getaffinity(0))

@@ -30,7 +30,7 @@ from rivals import RIVALS, Rival, installed  # noqa: E402
 from timing import median_time  # noqa: E402
 
 from selfcal_ros.errors import InputError  # noqa: E402
-from selfcal_ros.files import write_json  # noqa: E402
+from selfcal_ros.outputs import write_json  # noqa: E402
 
 SIZES = (11, 21, 51, 101, 201, 401, 1001)
 OURS = {"solve": "selfcal", "re-solve": "selfcal (factored plan)",

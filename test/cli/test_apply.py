@@ -11,10 +11,10 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.main import main
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import random_map, result_of
 from test.support.sessions import collected, events_of, small_plan

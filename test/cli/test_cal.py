@@ -8,10 +8,10 @@ import pytest
 
 from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.cli.main import main
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability, result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.outputs import write_json
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(7, 0.01, 24), 11)

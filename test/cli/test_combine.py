@@ -9,9 +9,10 @@ import pytest
 from selfcal_ros.apply import load
 from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import read_json, write_json
+from selfcal_ros.files import read_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from test.support.options import bare
 from test.support.truth import hu_plan, random_truth, simulate_measurements

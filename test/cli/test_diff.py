@@ -14,11 +14,11 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import read_json, write_json
+from selfcal_ros.files import read_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
+from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.figures import maps, paper
 from selfcal_ros.reporting.figures.drawing import Drawing
 from test.support.truth import hu_plan, random_truth, simulate_measurements

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.outputs import write_json
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(5, 0.01), 3)

@@ -12,9 +12,9 @@ from matplotlib.image import imread
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.sections import summary_text
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 

@@ -10,7 +10,6 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import (
     Observability,
@@ -30,6 +29,7 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 from selfcal_ros.model.view import View
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
 from test.support.results import known_result
 

@@ -19,7 +19,7 @@ from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_json, write_json
+from selfcal_ros.files import read_json
 from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -27,6 +27,7 @@ from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.outputs import write_json
 from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
 from test.support.mark_lists import listed_plan

@@ -17,7 +17,6 @@ from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import ExitCode, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
@@ -26,6 +25,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill, map_geometry
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.compensating import read_result
 from selfcal_ros.sessions.solving import Outcome, short

@@ -17,11 +17,11 @@ from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import write_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import session_digest, view_digest
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import DEFAULT_TERMS
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, supersedes
 from selfcal_ros.sessions.compensating import plan_file_name, read_result, result_file

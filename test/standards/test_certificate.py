@@ -17,10 +17,10 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
+from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.standards.chapter import certificate_chapter
 from selfcal_ros.standards.dcc import DCC, SI, certificate, is_traceable

@@ -12,11 +12,10 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.files import write_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.standards.iso230 import (

@@ -9,8 +9,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from selfcal_ros.files import write_json, write_text
-from selfcal_ros.model.json_form import plain
+from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.parallel import check_workers, outcomes
 from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case

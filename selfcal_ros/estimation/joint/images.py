@@ -184,7 +184,7 @@ def image_noise(artifact: Artifact, views: Sequence[View],
         The yaw of the stage, if the model has it.
     """
     mine = tuple(views[index] for index in system.grid_index)
-    if not system.direct or not any(view.cell is not None for view in mine):
+    if not system.direct or all(view.cell is None for view in mine):
         return None
     key = tuple((view.plan_view, view.step_on_plate(artifact)) for view in mine)
     size = None if yaw is None else (yaw.half_m, tuple(yaw.arms.tolist()))

@@ -153,8 +153,10 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         ground, options.reference, rigid, terms, options.drift_degree,
         places=places_of(measurements, grid, ground, system.known_sites),
         at_places=options.at_places,
-        images=image_noise(measurements.artifact, [v.view for v in measurements.views], system,
-                           ground.yaw if TermName.YAW in [term.name for term in terms] else None))
+        images=image_noise(
+            measurements.artifact, [v.view for v in measurements.views], system,
+            ground.yaw if TermName.YAW in [term.name for term in terms] else None,
+        ) if measurements.has_images else None)
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
 

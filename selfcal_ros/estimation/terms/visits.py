@@ -300,7 +300,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
-                      stage_yaw(measurements.artifact, views))
+                      stage_yaw(measurements.artifact, views) if measurements.has_images else None)
 
 
 def without_noise(ground: TermInputs, residuals: np.ndarray,

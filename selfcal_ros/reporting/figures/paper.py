@@ -18,7 +18,7 @@ from matplotlib.path import Path as Outline
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import write_bytes
+from selfcal_ros.outputs import write_bytes
 from selfcal_ros.reporting.figures.drawing import COLOURS, Discs, Drawing, Label, Path, Point
 
 DPI = 150

@@ -34,7 +34,7 @@ from selfcal_ros.reporting.summary.numbers import (
     um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
-from selfcal_ros.reporting.words.tables import excluded_text
+from selfcal_ros.reporting.words.phrases import excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -47,6 +48,21 @@ def line_text(line: BudgetLine) -> str:
         return f"curvature of the map; assumes that it is smooth between {nodes}"
     return ("no noise was found" if line.unit != "m/m" else
             "none: the scale is a convention, and not part of the map")
+
+
+_EXCLUDED: dict[str, str] = {
+    TermName.PLATE_SHAPE: "bending that differs between views",
+    TermName.DRIFT: "drift during each view",
+    TermName.APPROACH: "difference between directions of approach"}
+
+
+def excluded_text(line: BudgetLine) -> str:
+    """Return an effect outside U, what it would add to u, and how it is declared."""
+    name = line.component.removeprefix("term ")
+    size, u, largest = (f"{value * UM_PER_M:.3g} µm"
+                        for value in (line.u, line.effect_rms, line.effect_max))
+    return (f"{_EXCLUDED.get(name, name)}: {size} would add u {u} rms, {largest} largest "
+            f"(declare it: --model {name}:SIZE)")
 
 
 STILL_GOOD = "Still good"

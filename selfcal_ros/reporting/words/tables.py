@@ -101,21 +101,6 @@ def budget_text(found: list[Budget]) -> list[str]:
     return lines
 
 
-_EXCLUDED: dict[str, str] = {
-    TermName.PLATE_SHAPE: "bending that differs between views",
-    TermName.DRIFT: "drift during each view",
-    TermName.APPROACH: "difference between directions of approach"}
-
-
-def excluded_text(line: BudgetLine) -> str:
-    """Return an effect outside U, what it would add to u, and how it is declared."""
-    name = line.component.removeprefix("term ")
-    size, u, largest = (f"{value * UM_PER_M:.3g} µm"
-                        for value in (line.u, line.effect_rms, line.effect_max))
-    return (f"{_EXCLUDED.get(name, name)}: {size} would add u {u} rms, {largest} largest "
-            f"(declare it: --model {name}:SIZE)")
-
-
 def dof_text(dof: float) -> str:
     """Return degrees of freedom as an integer, or ``many``."""
     return f"{dof:.0f}" if dof < COUNTED_DOF else "many"

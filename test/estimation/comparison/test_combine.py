@@ -17,10 +17,10 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
-from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
 from test.support.maps import random_map, result_of
 from test.support.options import bare

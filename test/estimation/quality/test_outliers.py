@@ -20,12 +20,12 @@ from selfcal_ros.estimation.quality.residuals import (
     residuals_of,
 )
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.json_form import plain
 from selfcal_ros.model.readings import OUTLIER, GridVisits, Sense, ViewReadings, subset, without
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
