@@ -31,7 +31,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     from selfcal_ros.collection.settings.estimator import calibration_of
     from selfcal_ros.errors import ExitCode, InputError
     from selfcal_ros.estimation.recheck.change import known_plate
-    from selfcal_ros.estimation.recheck.solve import predict_recheck
+    from selfcal_ros.estimation.recheck.planned import predict_recheck
     from selfcal_ros.outputs import plain
     from selfcal_ros.reporting.summary.numbers import counted
 

@@ -8,11 +8,18 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.wiring import check_wiring
-from selfcal_ros.estimation.joint.camera import Camera, camera_of, straightened, yaw_of
+from selfcal_ros.estimation.joint.camera import (
+    Camera,
+    camera_of,
+    known_camera,
+    straightened,
+    yaw_of,
+)
+from selfcal_ros.estimation.joint.images import KEY
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.change import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact
@@ -58,7 +65,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         if options.prior:
             raise InputError("prior", f"the plate is known from {options.plate_from}",
                              "solve without a prior")
-        return recheck(measurements, options, known_plate(options.plate, options.plate_from))
+        plate = known_plate(options.plate, options.plate_from)
+        return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
     options = options if camera is None else _knowing(camera, options)
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
@@ -80,15 +88,21 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 
 def _check_images(measurements: Measurements, options: Options) -> None:
     """Refuse images of several marks where their common noise would be missing in U."""
-    if not measurements.has_images:
-        return
-    if options.plate is not None:
-        raise InputError(f"plan '{measurements.plan_id}'", "images of several marks do not serve "
-                         "for a recheck: U would not hold the noise that they share",
-                         "recheck with one mark an image, or calibrate anew")
-    if options.method == "law":
+    if options.method == "law" and measurements.has_images:
         raise InputError("method law", "Hu's law has no place for images of several marks",
                          "solve with --method joint")
+
+
+def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurements:
+    """Return readings of a known plate freed from the camera that its calibration found."""
+    if not measurements.has_images:
+        return measurements
+    if KEY not in plate.result.extra:
+        raise InputError(plate.where, "its noise is not told apart into that of images and that of "
+                         "marks, and the readings have images of several marks",
+                         "recheck with one mark an image, or calibrate with such images")
+    camera = known_camera(plate.result)
+    return measurements if camera is None else straightened(measurements, camera)
 
 
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:

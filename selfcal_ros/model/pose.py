@@ -3,6 +3,7 @@
 
 import cmath
 import math
+import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -320,6 +321,16 @@ class Image:
                              "marks", "leave image out: one mark in an exposure")
         return whole_steps(self.pitch_m / artifact.grid_pitch_m, "image pitch_m", "pitch",
                            "let cells be whole pitches of the plate apart")
+
+
+def cell_label(cell: tuple[int, int]) -> str:
+    """Return what the name of a sub-view has behind that of its view."""
+    return f"[{cell[0]:+d},{cell[1]:+d}]"
+
+
+def without_cell(name: str) -> str:
+    """Return the name of the view in the plan from that of a view or sub-view."""
+    return re.sub(r"\[[+-]\d+,[+-]\d+\]$", "", name)
 
 
 def nearest_step(value: float) -> int | None:

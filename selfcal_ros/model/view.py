@@ -26,6 +26,7 @@ from selfcal_ros.model.pose import (
     PlacedPose,
     Pose,
     StagePose,
+    cell_label,
     image_of,
     nearest_step,
     turn_in_lines,
@@ -101,7 +102,7 @@ class View:
     @property
     def plan_view(self) -> str:
         """Name of the view in the plan: of a sub-view without its cell."""
-        return self.name if self.cell is None else self.name.removesuffix(_label(self.cell))
+        return self.name if self.cell is None else self.name.removesuffix(cell_label(self.cell))
 
     @property
     def sub_views(self) -> tuple["View", ...]:
@@ -110,7 +111,7 @@ class View:
             return (self,)
         out = []
         for cell in self.image.cells:
-            view = replace(self, name=self.name + _label(cell), cell=cell,
+            view = replace(self, name=self.name + cell_label(cell), cell=cell,
                            angular=self.angular and cell == (0, 0))
             x, y = self.translation_m
             out.append(replace(view, translation_m=(x - view.cell_m.real, y - view.cell_m.imag)))
@@ -210,10 +211,6 @@ class View:
         return lines if lines is not None else whole_steps(
             self.rotation_rad * artifact.angular_count / math.tau, f"view '{self.name}' rotation",
             "angular line", "turn by whole lines, or set angular to false, or give map: harmonics")
-
-
-def _label(cell: tuple[int, int]) -> str:
-    return f"[{cell[0]:+d},{cell[1]:+d}]"
 
 
 def with_sub_views(views: Iterable[View]) -> tuple[View, ...]:

@@ -15,6 +15,7 @@ from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, Se
 from selfcal_ros.estimation.api import Options, calibrate, pure_noise
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
+from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
@@ -362,7 +363,7 @@ class SolvingSession:
         """Publish the map of a RESULT.json and log it."""
         result = read_result(path)
         self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
-                           views_done=len(result.views))
+                           views_done=len({without_cell(view.name) for view in result.views}))
         self._saved = ""
         self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"

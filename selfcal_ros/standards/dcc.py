@@ -13,6 +13,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
+from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import PRIOR, CalibrationResult
 from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.reporting.chapters import convention_section
@@ -252,9 +253,11 @@ def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
     if np.isfinite(made.duration_s):
         yield "duration", f"{made.duration_s:.0f} s"
     for view in result.views:
-        yield f"view {view.name}", (f"turned {np.degrees(view.rotation):.6g}°, shifted "
-                                    f"({view.translation_x:.6g}, {view.translation_y:.6g}) m, "
-                                    f"{view.used} readings, {view.rejected} rejected")
+        name = without_cell(view.name)
+        cell = view.name.removeprefix(name)
+        yield f"view {name}, cell {cell}" if cell else f"view {name}", (
+            f"turned {np.degrees(view.rotation):.6g}°, shifted ({view.translation_x:.6g}, "
+            f"{view.translation_y:.6g}) m, {view.used} readings, {view.rejected} rejected")
     for kind, name in (("xy", "x and y"), ("theta", "theta")):
         if np.isfinite(k := getattr(noise, f"k_{kind}")):
             yield f"coverage of {name}", (f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))}"

@@ -22,6 +22,7 @@ from selfcal_ros.estimation.comparison.covariance import (
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.both import BothCovariance
+from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -70,6 +71,18 @@ class Together:
                               half_width_m=self.length_m, sigma_m=noise.sigma_xy)
 
     @cached_property
+    def _images(self) -> ImageNoise | None:
+        return images_behind(self.result, self.system)
+
+    def _of_noise(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return the covariance of functionals of both maps for noise of marks and images."""
+        cover = self._both.of(sites, marks)
+        if self._images is None:
+            return cover
+        return cover + share_of(self.result) * self._images.added_covariance(
+            self._both.sensitivities(sites, marks))
+
+    @cached_property
     def _effects(self) -> np.ndarray:
         """Effects that are no terms of the model, for unit noise, (e, 2, nx, ny)."""
         kept = self.result.extra.get(KEY, {}).get(BESIDE, {"with_map": 0})
@@ -114,13 +127,17 @@ class Together:
         if is_flipped(self.result):  # G(X) = -H(-X)
             rows_g = -rows_g[:, ::-1, ::-1]
         exact = np.zeros((s + m + 4, s + m + 4))
-        exact[:-4, :-4] = self._both.of(
+        exact[:-4, :-4] = self._of_noise(
             np.concatenate([rows_g, np.zeros((m, *rows_g.shape[1:]))]),
             np.concatenate([np.zeros((s, *rows_a.shape[1:])), rows_a]))
         factors = self._factors(sites, marks)
         terms = len(factors) - len(self._effects)
         cover = exact + factors[:terms].T @ factors[:terms]
-        cover[:-4, :-4] *= self._ratio
+        if self._images is None:
+            cover[:-4, :-4] *= self._ratio
+        else:  # their noise moves the stage's map much and the plate's little
+            root = np.sqrt(np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4]))
+            cover *= np.outer(root, root)
         effects = factors[terms:]
         cover += effects.T @ effects
         if len(effects):
@@ -134,13 +151,23 @@ class Together:
         rows = unit_rows(known)
         if is_flipped(self.result):
             rows = rows[:, ::-1, ::-1]
-        white = np.trace(self._both.of(rows, np.zeros((len(rows), *self.marks.shape))))
+        white = np.trace(self._of_noise(rows, np.zeros((len(rows), *self.marks.shape))))
         factors = factors_of(self.result)[..., known]
         white += (factors**2).sum()
         effects = (self._effects[..., known] ** 2).sum()
         found = (emap.u_gx[known] ** 2 + emap.u_gy[known] ** 2).sum()
         sigma = max(self.result.noise.sigma_xy, np.finfo(float).tiny)
         return float(max((found / sigma**2 - effects) / (white - effects), 0.0))
+
+    @cached_property
+    def _ratio_of_plate(self) -> float:
+        """The same of the plate's map, which noise of images moves otherwise."""
+        plate, known = self.result.artifact_map, self.marks
+        rows = unit_rows(known)
+        white = np.trace(self._of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
+        white += (self._kept("plate", (2, *known.shape))[..., known] ** 2).sum()
+        found = (plate.u_ax[known] ** 2 + plate.u_ay[known] ** 2).sum()
+        return float(found / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
 
     def lines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return lines known in both angular maps, bool (2, K), and their covariance, rad^2.

@@ -72,6 +72,20 @@ class BothCovariance:
         cov += np.real(a.conj().T @ (self._noise[:, None] * a))
         return (cov + cov.T) / 2
 
+    def sensitivities(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return those of functionals as in `of` to the readings, over their weights, plate frame.
+
+        Complex (k, views, nx, ny).
+        """
+        count, grid = len(sites), self.system.grid
+        g, a, _ = self._free(sites.reshape(count, -1).T, marks.reshape(count, -1).T)
+        g, moved = self._readings(g, a)
+        parameters = self._p @ (moved - np.real(grid.response.conj().T @ g))
+        field = grid.factor.solve(np.ascontiguousarray(g)) - grid.response @ parameters
+        rest = grid.plate(np.zeros(1), field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
+        of_mark = (self._noise[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
+        return np.where(grid.read, of_mark, 0) - rest
+
     def of_lines(self, stage: np.ndarray, plate: np.ndarray,
                  sigma: tuple[float, float]) -> np.ndarray:
         """Return the covariance of functionals of both angular maps without terms, (k, k), rad^2.

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName
 
 DEGREE_LEVEL = 1e-3
@@ -35,7 +37,30 @@ Powers = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Distortion:
+    """Errors of a camera as a polynomial: published minus true offset, by the true one.
+
+    Attributes
+    ----------
+    powers : sequence of tuple
+        Of the polynomial, see `POWERS`.
+    coefficients : complex array (1 + powers,)
+        Its constant, 0, and its coefficients, places and errors in m.
+    """
+
+    powers: Powers
+    coefficients: np.ndarray
+
+    def at(self, offset: np.ndarray) -> np.ndarray:
+        """Return the error at published offsets, complex, m: that at the true ones."""
+        error = np.zeros_like(offset)
+        for _ in range(STEPS):
+            error = _terms(offset - error, self.powers) @ self.coefficients
+        return error
+
+
+@dataclass(frozen=True, eq=False)
+class Camera(Distortion):
     """Errors of a camera: published minus true offset, as a function of the true one.
 
     Attributes
@@ -45,10 +70,6 @@ class Camera:
         optical axis, m.
     u : float array (cells, 2)
         Standard uncertainties of the errors along x and y, m.
-    powers : sequence of tuple
-        Of the polynomial, see `POWERS`.
-    coefficients : complex array (1 + powers,)
-        Its constant, 0, and its coefficients, places and errors in m.
     u_coefficients : float array (1 + powers, 2)
         Standard uncertainties of their real and imaginary parts.
     noise_image, noise_mark : float
@@ -58,18 +79,9 @@ class Camera:
     place: np.ndarray
     error: np.ndarray
     u: np.ndarray
-    powers: Powers
-    coefficients: np.ndarray
     u_coefficients: np.ndarray
     noise_image: float
     noise_mark: float
-
-    def at(self, offset: np.ndarray) -> np.ndarray:
-        """Return the error at published offsets, complex, m: that at the true ones."""
-        error = np.zeros_like(offset)
-        for _ in range(STEPS):
-            error = _terms(offset - error, self.powers) @ self.coefficients
-        return error
 
     @property
     def u_linear(self) -> tuple[float, float, float]:
@@ -138,8 +150,8 @@ def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
         powers, fit = _polynomial(published - error, found, samples)
         error = found - (fit @ found)[0]
     spread = samples @ fit.T
-    return Camera(published - error, error, _spread(samples - spread[:, :1]), powers, fit @ error,
-                  _spread(spread), noises.image, noises.mark)
+    return Camera(powers, fit @ error, published - error, error, _spread(
+        samples - spread[:, :1]), _spread(spread), noises.image, noises.mark)
 
 
 def _spread(samples: np.ndarray) -> np.ndarray:
@@ -182,17 +194,35 @@ def _place(views: Sequence[ViewReadings]) -> complex:
                             .mean() for view in told if view.visits is not None]))
 
 
-def straightened(measurements: Measurements, camera: Camera) -> Measurements:
-    """Return the readings with the camera's error in each cell that of its mean offset."""
+def straightened(measurements: Measurements, camera: Distortion) -> Measurements:
+    """Return the readings with the camera's error in each cell that of its mean offset.
+
+    Or that of its nominal place, if the camera was found from other readings.
+    """
     image = next(view.view.image for view in measurements.views if view.view.image)
-    places = dict(zip(image.cells, camera.place + camera.error, strict=True))
+    places = dict(zip(image.cells, camera.place + camera.error, strict=True)) if isinstance(
+        camera, Camera) else {}
     return replace(measurements, views=tuple(
         view if view.view.cell is None or view.visits is None
-        else _straight(view, view.visits, camera, places[view.view.cell])
+        else _straight(view, view.visits, camera, places.get(view.view.cell, view.view.cell_m))
         for view in measurements.views))
 
 
-def _straight(view: ViewReadings, visits: GridVisits, camera: Camera,
+def known_camera(result: CalibrationResult) -> Distortion | None:
+    """Return the camera that a calibration found; None if it found none."""
+    found: Any = result.extra.get("camera", {})
+    if "coefficients" not in found:
+        return None
+    try:
+        powers = [(int(a), int(b)) for a, b in (one["power"] for one in found["coefficients"])]
+        values = np.array([0, *(complex(one["x"], one["y"]) for one in found["coefficients"])])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError("camera", "no polynomial of a camera",
+                         "write the result again with `selfcal solve`") from error
+    return Distortion(powers, values)
+
+
+def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
               place: complex) -> ViewReadings:
     offset = view.view.cell_m + visits.offset_x + 1j * visits.offset_y
     excess = camera.at(offset) - camera.at(np.array([place]))

@@ -10,15 +10,23 @@ noise make of them, the yaw of the stage fitted to them as to the readings.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.yaw import StageYaw
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View
+
+KEY = "images"
+"""Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
+degrees of freedom of that of a mark, and of each grid view the `placing` of the plate, a number,
+and the `step` (m, n) of its cell on the plate."""
 
 SAMPLES = 60_000
 """Readings of all draws together, and limits of the number of draws."""
@@ -29,12 +37,13 @@ FEWEST, MOST = 24, 64
 class TwoNoises:
     """Noises of one reading: common to the marks of an image, and of a mark, m.
 
-    `dof` are the degrees of freedom of what both make of the map.
+    `dof` are the degrees of freedom of what both make of the map, `dof_mark` those of `mark`.
     """
 
     image: float
     mark: float
     dof: float
+    dof_mark: float
 
     @property
     def sigma(self) -> float:
@@ -139,10 +148,13 @@ class ImageNoise:
             both[alone, 0] = 1 / expected[0, alone]
             found = both @ sums
         mark, image = np.sqrt(found)
-        scatter = (self.drawn @ [mark**2, image**2, mark * image]) @ ([1, self.gain] @ both)
-        spread = scatter.var(ddof=1)
-        dof = 2 * scatter.mean() ** 2 / spread if spread else math.inf
-        return TwoNoises(float(image), float(mark), float(dof))
+        drawn = self.drawn @ [mark**2, image**2, mark * image]
+        return TwoNoises(float(image), float(mark), _dof_of(drawn @ ([1, self.gain] @ both)),
+                         _dof_of(drawn @ both[0]))
+
+    def own(self, rest: np.ndarray) -> np.ndarray:
+        """Return the variances, (k,), for unit noise of each mark by itself."""
+        return (abs(self._each_and_together(rest)[0]) ** 2).sum(axis=1)
 
     def added(self, rest: np.ndarray) -> np.ndarray:
         """Return what full correlation within images adds to variances, (k,), for unit noise.
@@ -168,6 +180,12 @@ class ImageNoise:
         return one, together
 
 
+def _dof_of(draws: np.ndarray) -> float:
+    """Return the degrees of freedom of a variance from draws of its estimate."""
+    spread = draws.var(ddof=1)
+    return float(2 * draws.mean() ** 2 / spread) if spread else math.inf
+
+
 def image_noise(artifact: Artifact, views: Sequence[View],
                 system: NormalEquations, yaw: StageYaw | None = None) -> ImageNoise | None:
     """Return the images behind grid readings; None without images, or for iterated fields.
@@ -183,15 +201,70 @@ def image_noise(artifact: Artifact, views: Sequence[View],
     yaw : StageYaw, optional
         The yaw of the stage, if the model has it.
     """
-    mine = tuple(views[index] for index in system.grid_index)
-    if not system.direct or all(view.cell is None for view in mine):
+    key = cells_seen(artifact, [views[index] for index in system.grid_index])
+    if not system.direct or key is None:
         return None
-    key = tuple((view.plan_view, view.step_on_plate(artifact)) for view in mine)
     size = None if yaw is None else (yaw.half_m, tuple(yaw.arms.tolist()))
     return _known.get(system, (key, size), lambda: _drawn(system, key, yaw))
 
 
 _known: Memo[tuple, ImageNoise] = Memo()
+
+CellsSeen = Sequence[tuple[Any, tuple[int, int]]]
+"""Of each grid view its name in the plan, and the step of its cell on the plate."""
+
+
+def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
+    """Return the cells of images that grid views are; None without images."""
+    if not any(view.cell is not None for view in views):
+        return None
+    return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
+
+
+def kept_images(artifact: Artifact, views: Sequence[View], noises: TwoNoises) -> dict[str, Any]:
+    """Return what a result keeps of the noise of images in its grid views, see `KEY`."""
+    seen = cells_seen(artifact, views) or ()
+    names = list(dict.fromkeys(name for name, _ in seen))
+    return {KEY: {"share": noises.share, "dof_mark": noises.dof_mark,
+                  "placing": [names.index(name) for name, _ in seen],
+                  "step": [list(step) for _, step in seen]}}
+
+
+def share_of(result: CalibrationResult) -> float:
+    """Return the part of the variance of a reading that the marks of an image share; 0 without."""
+    return _kept_number(result, "share", 1.0)
+
+
+def dof_of_marks(result: CalibrationResult) -> float:
+    """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
+    return _kept_number(result, "dof_mark", math.inf)
+
+
+def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
+    try:
+        found = float(result.extra.get(KEY, {name: 0.0})[name])
+    except (TypeError, ValueError, KeyError, AttributeError):
+        found = math.nan
+    if not 0 <= found <= most:
+        raise InputError(KEY, "no noise of images", "write the result again with `selfcal solve`")
+    return found
+
+
+def images_behind(result: CalibrationResult, system: NormalEquations) -> ImageNoise | None:
+    """Return the images behind a result, for `added_covariance` alone; None without images."""
+    if not share_of(result):
+        return None
+    kept, grid = result.extra[KEY], system.grid
+    try:
+        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
+            kept["placing"], kept["step"], strict=True)]
+    except (TypeError, ValueError, KeyError):
+        seen = []
+    if len(seen) != grid.n_views:
+        raise InputError(KEY, "no images of these views",
+                         "write the result again with `selfcal solve`")
+    return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
+                      np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 
 
 def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
@@ -212,11 +285,11 @@ def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
     return FittedYaw(grid.weight, residuals, parameters, inverse, int(told.sum()))
 
 
-def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]],
+def _drawn(system: NormalEquations, views: CellsSeen,
            yaw: StageYaw | None) -> ImageNoise:
     """Return images and draws of readings; `views` are the names in the plan and steps of cells."""
     grid = system.grid
-    stops = _stops(views, grid.read)
+    stops = stops_of(views, grid.read)
     weight = grid.weight[grid.read]
     drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
     fitted = None if yaw is None else _fitted_yaw(system, yaw)
@@ -236,7 +309,7 @@ def _drawn(system: NormalEquations, views: Sequence[tuple[str, tuple[int, int]]]
     return replace(plain, gain=float(power[1] / power[0]))
 
 
-def _stops(views: Sequence[tuple[str, tuple[int, int]]], read: np.ndarray) -> np.ndarray:
+def stops_of(views: CellsSeen, read: np.ndarray) -> np.ndarray:
     """Return the index of the stop of each reading, int array (n,).
 
     A stop is that of a view of the plan, at the mark from which the cell is as many steps away.

@@ -9,6 +9,7 @@ line or a pass, which repeats taken in quick succession do not show (method eq. 
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -67,10 +68,28 @@ def structured(model: ModelFit, cover: FieldCovariance,
         added = contrast * axis_variances(model, cover, rows)
     if len(correlation := time_correlation(model)):
         added = added + correlated_variances(model, cover, correlation, rows)
+    return added + image_variances(model, cover, rows)
+
+
+def image_variances(model: ModelFit, cover: FieldCovariance, rows: np.ndarray | None = None, *,
+                    plate: bool = False) -> np.ndarray | float:
+    """Return what the noise that marks of an image share adds to the variances for unit noise.
+
+    Those of the stage's map, of functionals `rows` of it, or of the plate's map.
+
+    Where noise of the offsets is all that shows a microscope, its columns exaggerate the
+    sensitivities: then noise of a mark must not make more than the variance itself.
+    """
     images = model.problem.images
-    if images is not None and (share := images.noises(model.found.residuals).share):
-        added = added + share * added_variances(model, cover, images.added, rows)
-    return added
+    if images is None or not (share := images.noises(model.found.residuals).share):
+        return 0.0
+    of = _plate_variances if plate else partial(added_variances, rows=rows)
+    added = of(model, cover, images.added)
+    whole = np.stack(cover.diagonal()) if rows is None else np.diag(cover.of(rows))
+    if (added < -whole).any():
+        own = of(model, cover, images.own)
+        added = added * np.minimum(1.0, whole / np.where(own > 0, own, 1.0))
+    return share * added
 
 
 def axis_variances(model: ModelFit, cover: FieldCovariance,
@@ -130,8 +149,8 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
     return out.reshape(2, *grid.views.shape)
 
 
-def plate_variances(model: ModelFit, cover: FieldCovariance,
-                    of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _plate_variances(model: ModelFit, cover: FieldCovariance,
+                     of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return `of` the sensitivities of each coordinate of the plate's map, (2, nx, ny).
 
     Parameters

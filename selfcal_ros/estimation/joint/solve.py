@@ -31,12 +31,12 @@ from selfcal_ros.estimation.datum.plate import (
 )
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
-from selfcal_ros.estimation.joint.images import image_noise
+from selfcal_ros.estimation.joint.images import image_noise, kept_images
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
     MAX_SITES,
-    plate_variances,
+    image_variances,
     structured,
 )
 from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
@@ -181,12 +181,21 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
         measurements.all_rejected(), findings=findings, method="joint",
         sense=str(measurements.sense),
-        extra={"solver": found.solver, **kept, **kept_residuals(measurements, model)},
+        extra={"solver": found.solver, **kept, **_kept_images(measurements, model),
+               **kept_residuals(measurements, model)},
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(
             model, {term.name for term in options.terms})),
         placed_plate=measurements.artifact if measurements.artifact.map_grid else None)
     return Solved(result, found.xy, found.theta, model, axes)
+
+
+def _kept_images(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
+    if model.problem.images is None:
+        return {}
+    views = [measurements.views[index].view for index in model.problem.grid.index]
+    return kept_images(measurements.artifact, views,
+                       model.problem.images.noises(model.found.residuals))
 
 
 def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
@@ -351,10 +360,8 @@ def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> Artifact
             of_plate = plate_covariance(cover, options.reference, columns=columns,
                                         half_width_m=length, sigma_m=sigma)
             variance = np.stack(of_plate.diagonal())
-            images = problem.images
-            if images is not None and system.grid.n_sites <= MAX_SITES:
-                variance = variance + images.noises(found.residuals).share * plate_variances(
-                    model, of_plate, images.added)
+            if system.grid.n_sites <= MAX_SITES:
+                variance = variance + image_variances(model, of_plate, plate=True)
         else:
             both = BothCovariance(system, found.inverse, options.reference, half_width_m=length,
                                   sigma_m=sigma)

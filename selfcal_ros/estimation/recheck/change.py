@@ -141,8 +141,10 @@ class NewMap:
         The map, no translation and rotation, m.
     gain : Gain
         Of the map (2 nx ny), from the readings; its noise without that of the plate, m^2.
-    white : float array (r,)
-        Variance of the noise of each reading, m^2.
+    white : float array (2 r,)
+        Variance of the noise of each reading by itself, m^2.
+    images : float array (2 r, 2 stops)
+        The readings for the noise of each image, m.
     plate : float array (r, 2 m + 4)
         The readings for a unit of Ax, Ay at each known mark, and of the microscope.
     marks : bool array (mx, my)
@@ -156,6 +158,7 @@ class NewMap:
     xy: np.ndarray
     gain: Gain
     white: np.ndarray
+    images: np.ndarray
     plate: np.ndarray
     marks: np.ndarray
     dof: float
@@ -172,6 +175,7 @@ class NewMap:
         moved = rows @ self.plate
         of_plate = np.einsum("ij,ij->i", moved @ plate.kept.cover(nowhere, self.marks), moved)
         of_noise = np.einsum("ij,j,ij->i", rows, self.white, rows)
+        of_noise += ((rows @ self.images)**2).sum(axis=1)
         whole = np.einsum("ij,ij->i", rows @ self.gain.noise, rows)
         return {"reading noise": of_noise, "known plate": np.maximum(of_plate, 0.0),
                 "terms": np.maximum(whole - of_noise, 0.0)}

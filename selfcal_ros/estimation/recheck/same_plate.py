@@ -89,6 +89,8 @@ class _Read:
 def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> Finding | None:
     """Return a finding if another plate was read, or one whose marks have changed.
 
+    Of images by the marks on the optical axis.
+
     Parameters
     ----------
     measurements : Measurements
@@ -103,7 +105,7 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
     PlacingError
         If the plate is not placed as planned.
     """
-    for view in measurements.views:
+    for view in (one for one in measurements.views if one.view.cell in (None, (0, 0))):
         seen = _read(view, measurements, plate, sigma)
         planned = None if seen is None else seen.left(plate.field, measurements.artifact, (0, 0j))
         if seen is None or planned is None:

@@ -10,6 +10,7 @@ from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
@@ -28,7 +29,6 @@ from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import system_for
-from selfcal_ros.estimation.observability.prediction import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import (
     KnownPlate,
@@ -55,14 +55,19 @@ from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, rms
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability, ViewResult
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
-from selfcal_ros.model.view import Plan, View
 
 KEY = "recheck"
 """Key of what a recheck found among the extras of a result."""
+
+MOST_OF_IMAGES = 3200
+"""Largest number of readings of images: their covariance is dense, 8 bytes (2 n)^2."""
+
+LEAST_PART = 1e-6
+"""Least part of the variance of a reading that is a mark's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,7 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
         raise InputError("options", "a recheck has the method joint, and the reference length of "
                          "the plate's calibration", "leave them out")
     readings = plate_readings(on_plate(measurements, plate), options, plate)
-    xy, theta = _noise(readings.problem, plate)
+    xy, theta = _noise(readings, plate)
     new, seen = _new_map(readings, plate, xy, options)
     return Rechecked(readings, new, _new_lines(readings, plate, theta), seen, xy, theta)
 
@@ -142,7 +147,8 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
                    solved.new.artifact, plate.where)
     noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
-    failed = (other,) if other is not None else _misfit(seen, solved.xy.dof)
+    failed = (other,) if other is not None else _misfit(
+        seen, dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
     found["passes"] = min(view.view.repeats for view in measurements.views)
     before = plate.result.verdict
     result = CalibrationResult(
@@ -196,8 +202,14 @@ def plate_readings(measurements: Measurements, options: Options,
         at_places=options.at_places, turn_rad=np.zeros(len(grid.index)))
     problem = turned(problem) if problem.rigid else problem
     quiet = without_noise(problem.ground, np.zeros(grid.y.shape))
+    cells = cells_seen(artifact, [measurements.views[index].view for index in grid.index])
+    if cells is not None and (count := np.count_nonzero(grid.weight)) > MOST_OF_IMAGES:
+        raise InputError(f"plan '{measurements.plan_id}'", f"{count} readings of marks in images "
+                         f"are beyond the limit of {MOST_OF_IMAGES} of a recheck",
+                         "state fewer marks in an image (image in PLAN.yaml)")
     return PlateReadings(measurements, problem, term_columns(quiet, terms, options.drift_degree),
-                         np.nonzero(grid.weight))
+                         np.nonzero(grid.weight), np.zeros(0, dtype=int) if cells is None
+                         else stops_of(cells, grid.weight > 0))
 
 
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
@@ -211,12 +223,20 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     return terms
 
 
-def _noise(problem: Problem, plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
-    """Return the noise of the readings: declared, of many repeats, or that of the calibration."""
-    before, out = plate.result.noise, []
-    for kind, repeats, data in (("xy", problem.repeats_xy, problem.grid),
-                                ("theta", problem.repeats_theta, problem.angular)):
-        found = noise_estimate(repeats, (float("nan"), 0), data.sigma_declared)
+def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
+    """Return the noise of the readings: declared, of many repeats, or that of the calibration.
+
+    What detections of images declare is the noise of a mark, without that of its image.
+    """
+    problem, before, nan = readings.problem, plate.result.noise, float("nan")
+    of_marks, of_mark, out = problem.repeats_xy, problem.grid.sigma_declared, []
+    if len(readings.stop):
+        fewer = 1 + (readings.marks_of_image - 1) * share_of(plate.result)
+        of_marks, of_mark = (of_marks[0], of_marks[1] / fewer), nan
+    for kind, repeats, declared in (
+            ("xy", of_marks, of_mark),
+            ("theta", problem.repeats_theta, problem.angular.sigma_declared)):
+        found = noise_estimate(repeats, (nan, 0), declared)
         if not (found.sigma > 0 and found.dof >= MIN_REPEAT_DOF):
             found = replace(found, sigma=getattr(before, f"sigma_{kind}"),
                             dof=getattr(before, f"dof_{kind}"))
@@ -228,8 +248,9 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
              options: Options) -> tuple[NewMap, Seen]:
     """Return the map of the stage, stage frame, and as it was solved."""
     values, size = readings.of_terms()
-    terms = stacked(values) * size
-    noise = np.diag(np.tile(xy.sigma**2 / readings.weight, 2)) + terms @ terms.T
+    terms, (mark, image) = stacked(values) * size, _two_noises(readings, plate, xy)
+    white, images = np.tile(mark / readings.weight, 2), np.sqrt(image) * readings.of_images()
+    noise = np.diag(white) + images @ images.T + terms @ terms.T
     microscope, size = readings.of_microscope()
     found = plate.microscope
     if found is None or any(term.name is TermName.MICROSCOPE for term in options.terms):
@@ -245,8 +266,21 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
     if readings.measurements.sense is Sense.PLATE_MOVES:  # G(X) = -H(-X)
         field, known, rows = -field[::-1, ::-1], known[::-1, ::-1], -rows[:, ::-1, ::-1]
     return NewMap(readings.measurements.artifact.field, known, np.stack([field.real, field.imag]),
-                  Gain(rows.reshape(2 * n, -1), noise),
-                  np.tile(xy.sigma**2 / readings.weight, 2), of_plate, marks, xy.dof), seen
+                  Gain(rows.reshape(2 * n, -1), noise), white, images, of_plate, marks,
+                  xy.dof), seen
+
+
+def _two_noises(readings: PlateReadings, plate: KnownPlate,
+                xy: NoiseEstimate) -> tuple[float, float]:
+    """Return the variances of the noise of a mark, and of that which an image's marks share, m^2.
+
+    That of a mark is the calibration's, and not none: the readings have to be weighted.
+    """
+    if not len(readings.stop):
+        return xy.sigma**2, 0.0
+    mark = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
+    mark = float(np.clip(mark, LEAST_PART * xy.sigma**2, xy.sigma**2))
+    return mark, xy.sigma**2 - mark
 
 
 def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewLines:
@@ -345,55 +379,3 @@ def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
                          source, details)
     yield from (line for line in budget_lines(result)
                 if (line.quantity, line.component) == ("xy", INTERPOLATION))
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedRecheck:
-    """Predicted uncertainties, in units of the noise of one averaged reading.
-
-    Attributes
-    ----------
-    map : Prediction
-        Of the new map.
-    change : float
-        Of the change of a coordinate, rms over the nodes.
-    """
-
-    map: Prediction
-    change: float
-
-
-@one_thread()
-def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
-    """Return what views of a known plate will tell, with the noise of its calibration.
-
-    Raises
-    ------
-    NotIdentifiableError, InputError
-        As `selfcal_ros.estimation.recheck.solve.recheck`.
-    """
-    readings = Measurements(plan.plan_id, plan.artifact, tuple(
-        _planned(view, plan) for view in plan.views))
-    found: Rechecked = recheck_of(readings, Options(assumed=(), misalignment_model="linear"), plate)
-    noise = plate.result.noise
-    root = np.sqrt(min(view.repeats for view in plan.views))
-    unit = noise.sigma_xy / root
-    emap = found.error_map(plate)
-    u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
-    return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
-                          rms(map_change(found.new, plate).u) / unit)
-
-
-def _planned(view: View, plan: Plan) -> ViewReadings:
-    """Return the readings of a view, all 0."""
-    out, artifact = ViewReadings(view), plan.artifact
-    if view.grid:
-        read = view.pose.in_field(artifact)
-        nothing = np.zeros(int(read.sum()))
-        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
-                      count=np.full(len(nothing), view.repeats))
-    if view.angular and artifact.angular_count:
-        lines = np.arange(artifact.angular_count)
-        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
-                      count_theta=np.full(len(lines), view.repeats))
-    return out

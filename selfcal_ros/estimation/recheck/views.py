@@ -108,12 +108,15 @@ class PlateReadings:
         Terms of the model.
     at : tuple of int arrays (r,)
         View, row and column of each reading of a known mark.
+    stop : int array (r,)
+        Index of the stop of the stage at which each was made; empty without images.
     """
 
     measurements: Measurements
     problem: Problem
     columns: TermColumns
     at: tuple[np.ndarray, ...]
+    stop: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
@@ -159,6 +162,20 @@ class PlateReadings:
                 part = MICROSCOPE_PARTS.index(column.component)
                 out[:, part], size[part] = self.columns.grid[(i, *self.at)], column.size
         return out, size
+
+    def of_images(self) -> np.ndarray:
+        """Return the readings for unit noise of each image, one reading's, (2 r, 2 stops)."""
+        if not len(self.stop):
+            return np.zeros((2 * len(self.at[0]), 0))
+        one = (self.stop[:, None] == np.arange(self.stop.max() + 1)) / np.sqrt(
+            self.weight)[:, None]
+        return np.kron(np.eye(2), one)
+
+    @property
+    def marks_of_image(self) -> float:
+        """Number of marks of an image, as a mean over its marks; 1 without images."""
+        count = np.bincount(self.stop)
+        return float((count**2).sum() / count.sum()) if len(count) else 1.0
 
     def of_marks(self) -> tuple[np.ndarray, np.ndarray]:
         """Return which marks were read, bool (nx, ny), and the readings for a unit of Ax, Ay."""

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.result import CalibrationResult, ViewResult
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import check_marks
@@ -49,7 +50,7 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
 
 
 def views_in(result: CalibrationResult) -> list[View]:
-    """Return the views of a result, as far as it knows them.
+    """Return the views of a result, as far as it knows them; not the other cells of images.
 
     On the lattice grids are read after quarter turns; else the offset of such a view is known.
     """
@@ -57,7 +58,8 @@ def views_in(result: CalibrationResult) -> list[View]:
     return [View(view.name, view.rotation, (view.translation_x, view.translation_y),
                  math.isfinite(view.tx) if placed else
                  abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6, angular=False)
-            for view in result.views]
+            for view in result.views if view.name.endswith(cell_label((0, 0)))
+            or view.name == without_cell(view.name)]
 
 
 def _corners(artifact: Artifact) -> np.ndarray:

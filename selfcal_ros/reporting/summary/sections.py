@@ -11,6 +11,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import PRIOR, CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -34,7 +35,7 @@ from selfcal_ros.reporting.summary.numbers import (
     um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
-from selfcal_ros.reporting.words.phrases import excluded_text
+from selfcal_ros.reporting.words.phrases import counted_views, excluded_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -114,7 +115,8 @@ def measurement_section(result: CalibrationResult) -> Section:
              f"{nx} × {ny} marks, pitch {pitch:.6g} mm")
     x, y = (2 * half * pitch for half in artifact.reach)
     seen = result.observability
-    views = f"{counted(len(result.views), 'view')}, {views_done(result)} measured"
+    done = {without_cell(view.name) for view in result.views if measured(view)}
+    views = f"{counted_views(result.views)}, {len(done)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
              ("plate", f"{marks}, field {x:.6g} × {y:.6g} mm, "
               f"{artifact.angular_count or 'no'} angular lines"),
@@ -142,11 +144,6 @@ def measurement_section(result: CalibrationResult) -> Section:
 def measured(view: ViewResult) -> bool:
     """Return whether anything was measured in a view."""
     return view.used > 0 or math.isfinite(view.phi)
-
-
-def views_done(result: CalibrationResult) -> int:
-    """Return the number of views that were measured."""
-    return sum(measured(view) for view in result.views)
 
 
 def views_section(result: CalibrationResult) -> Section:
@@ -339,8 +336,9 @@ def state_sentence(result: CalibrationResult) -> str:
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = f" at {figures.n_known} of {figures.n_sites} sites"
-    text = f"Calibrated{share * (figures.n_known < figures.n_sites)} from " + counted(
-        views_done(result), "view") + (" with a prior" if PRIOR in result.extra else "")
+    views = counted_views([view for view in result.views if measured(view)])
+    text = f"Calibrated{share * (figures.n_known < figures.n_sites)} from {views}" + (
+        " with a prior" if PRIOR in result.extra else "")
     if not figures.n_known:
         return text
     k = result.noise.k_xy

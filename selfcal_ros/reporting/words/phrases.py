@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Phrases for the lines of an uncertainty budget, and for the result of a recheck."""
+"""Phrases for the lines of an uncertainty budget, the result of a recheck, and counts of views."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.model.pose import without_cell
+from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
@@ -17,6 +19,14 @@ _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
 OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
               "terms": "sizes of the terms of the model, which these views do not tell"}
 """How a line of the budget was found, given the file of the plate."""
+
+
+def counted_views(views: Sequence[ViewResult]) -> str:
+    """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are no views."""
+    number = len({without_cell(view.name) for view in views})
+    cells = len({view.name.removeprefix(without_cell(view.name)) for view in views} - {""})
+    images = f" with images of {cells} marks" if cells else ""
+    return f"{number} view{'s' * (number != 1)}{images}"
 
 
 def line_text(line: BudgetLine) -> str:

@@ -223,10 +223,20 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
     assert found.observability.identifiable
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"method": "law"}, "Hu's law has no place for images of several marks; solve with --method"),
-    ({"plate": object()}, "images of several marks do not serve for a recheck")])
-def test_what_images_do_not_serve_for_is_refused(options, said):
+def test_hus_law_refuses_images():
     _, measurements = measured(MARK, 1, size=5)
-    with pytest.raises(InputError, match=said):
-        calibrate(measurements, Options(**options))
+    with pytest.raises(InputError, match="Hu's law has no place for images of several marks; "
+                                         "solve with --method"):
+        calibrate(measurements, Options(method="law"))
+
+
+def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():
+    """A draw whose noise, in a view that hardly turns, looks like a microscope's strain."""
+    plan, rng = image_plan(7), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=0.003, correlation_pitches=4.0))
+    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=MARK, servo_sigma_m=0.0)
+    found = calibrate(simulate_measurements(truth, plan, rng, settings=settings))
+    assert [cause.name for cause in found.verdict.causes] == ["microscope"]
+    for u in (found.error_map.u_gx, found.error_map.u_gy, found.artifact_map.u_ax,
+              found.artifact_map.u_ay):
+        assert (u > 0.2 * MARK).all()

@@ -14,7 +14,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.change import known_plate
-from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
+from selfcal_ros.estimation.recheck.planned import predict_recheck
+from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset

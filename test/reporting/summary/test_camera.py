@@ -10,11 +10,12 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
-from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw
+from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw, views_in
 from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of, significant, yaw_facts
-from selfcal_ros.reporting.summary.sections import summary_text, terms_section
+from selfcal_ros.reporting.summary.sections import state_sentence, summary_text, terms_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.standards import dcc as standards
 from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
@@ -40,6 +41,14 @@ def test_the_summary_states_the_camera():
     words = {line.split("  ")[1]: line for line in summary_text(result()).splitlines()
              if line.startswith("  ")}
     assert "-0.39" in words["scale"]
+
+
+def test_cells_of_images_are_no_views():
+    assert state_sentence(result()).startswith("Calibrated from 2 views with images of 9 marks: ")
+    assert "2 views with images of 9 marks, 2 measured" in summary_text(result())
+    assert [view.name for view in views_in(result())] == ["0[+0,+0]", "90[+0,+0]"]
+    named = standards._meta(result())
+    assert "view 0, cell [+1,-1]" in [name for name, _ in named]
 
 
 def test_the_summary_states_the_yaw_of_the_stage():
