@@ -183,6 +183,8 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
                              "correct the publisher")
     _check_values(where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy",
                                                             "sigma_theta"))
+    if not abs(readings.axis_theta) <= np.pi:
+        raise InputError(where, "axis_theta is no angle", "give rad")
     if readings.visits is not None:
         _check_values(f"{where}, visits", readings.visits, ("dx", "dy", "offset_x", "offset_y"),
                       ("u", "sigma_m"))

@@ -153,7 +153,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         "model_terms": list(measurements.model_terms), "session_notes": list(notes),
         **_map_grid(measurements.artifact), **_image(readings.view),
         "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1],
-        "artifact_from": measurements.artifact_from, **_marks(measurements.artifact)}
+        "artifact_from": measurements.artifact_from, **_marks(measurements.artifact),
+        "axis_theta": readings.axis_theta}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

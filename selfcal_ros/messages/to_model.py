@@ -195,7 +195,7 @@ def view_readings(message: Any) -> ViewReadings:
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
         used=int(message.detections_used), rejected=counts(message, "reject"),
         visits=_visits_of(message), motion=_motion_of(message, "motion", 4),
-        motion_theta=_motion_of(message, "motion_theta", 2))
+        motion_theta=_motion_of(message, "motion_theta", 2), axis_theta=float(message.axis_theta))
 
 
 def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:

@@ -159,6 +159,9 @@ class ViewReadings:
         The visits behind the means of the grid marks; None if unknown.
     places : RejectedPlaces
         Positions of rejected grid detections; empty if unknown.
+    axis_theta : float
+        With harmonics, the indicated angle of the axis about the nominal one in the frame of the
+        equations, mean of the lines, rad.
     outliers, outliers_theta : int array (P,) or (0,), (Q,) or (0,)
         Outliers among the repeats of each mark and line, additional to the count; empty if unknown.
     motion, motion_theta : RepeatMotion, optional
@@ -187,6 +190,7 @@ class ViewReadings:
     rejected: dict[str, int] = field(default_factory=dict)
     visits: GridVisits | None = None
     places: RejectedPlaces = RejectedPlaces()
+    axis_theta: float = 0.0
     outliers: np.ndarray = _empty(int)
     outliers_theta: np.ndarray = _empty(int)
     motion: RepeatMotion | None = None
@@ -323,7 +327,8 @@ def _digest(readings: ViewReadings) -> str:
     # the readings, not the settings of the measurement
     view = replace(readings.view, visit_order="", check_marks=0, check_offset_m=0.0)
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
-                        readings.dof_theta, readings.used, readings.rejected)).encode())
+                        readings.dof_theta, readings.used, readings.rejected,
+                        *([readings.axis_theta] if readings.axis_theta else []))).encode())
     return digest.hexdigest()
 
 

@@ -26,25 +26,17 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.figures.drawing import Path
 from selfcal_ros.reporting.figures.maps import CENTRE, angular_map
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from selfcal_ros.simulation.physics import encoder_error
 from test.support.options import BARE
+from test.support.plans import harmonic_plan as plan
 from test.support.truth import simulate_measurements
 
 SIGMA_RAD = 1e-6
-
-
-def plan(count, harmonics, turns_deg=(37, 101), size=5):
-    """Return {0, 90, tx} of marks, with lines at 0 and in views of their own at other turns."""
-    plate, quarter = Artifact(size, 0.01, count, harmonics=harmonics), math.pi / 2
-    return Plan("rotary", plate, (
-        View("first"), View("quarter", quarter, angular=False),
-        View("shift", 0.0, (0.01, 0.0), angular=False),
-        *(View(f"{turn}deg", math.radians(turn), grid=False) for turn in turns_deg)))
 
 
 def measured(views, seed=1, *, sigma_rad=SIGMA_RAD, lines=4.0, sense=Sense.MICROSCOPE_MOVES,
@@ -119,6 +111,28 @@ def test_readings_without_noise_give_the_truth_on_lines_and_between(count, harmo
         float(stage.correct_theta(angle[0])), abs=1e-15)
     np.testing.assert_allclose(stage.command_theta(stage.correct_theta(angle)), angle, atol=1e-14)
     assert np.isnan(stage.error_theta(np.array([np.nan, np.inf]))).all()
+
+
+@pytest.mark.parametrize("follow", [True, False])
+@pytest.mark.parametrize("sense", Sense)
+def test_the_axis_is_where_it_stood_not_where_it_was_to_stand(sense, follow):
+    """Plates lie some degrees beside: the map is read there, or at the plan if the axis is."""
+    views, rng = plan(24, 8), np.random.default_rng(4)
+    truth = random_truth(views.artifact, len(views.views), rng, Spread(
+        phi_rad=1e-3, correlation_pitches=3.0, g_theta_rad=5e-5))
+    beside = np.radians([0.0, 0.0, 0.0, 4.0, -3.0])  # those with lines alone
+    truth = replace(truth, phi_rad=truth.phi_rad + beside)
+    readings = simulate_measurements(truth, views, rng, settings=CellSettings(
+        sense, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0, follow_mark=follow))
+    result = calibrate(readings, BARE)
+    # the axis is taken where it stood for the mean line: lines scatter by some 2e-4 rad
+    assert np.abs(error_of(result, truth)).max() < 3e-8
+    errors = prediction_errors(readings, result, 3, readings.views[3], rigid=True)[1]
+    assert np.abs(errors).max() < 1e-7
+    nominal = replace(readings, views=tuple(
+        replace(view, axis_theta=0.0) for view in readings.views))
+    if follow:
+        assert np.abs(error_of(calibrate(nominal, BARE), truth)).max() > 1e-6
 
 
 def test_the_solution_is_that_of_one_dense_least_squares():

@@ -221,7 +221,7 @@ READ = ViewReadings(
     np.array([-4e-6]), np.array([5]), np.array([6e-8]), np.array([7]), np.array([-8e-3]),
     np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
     VISITS, motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
-    motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22))
+    motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22), axis_theta=0.01)
 MEASURED = Measurements("p", replace(PLATE, grid_pitch_m=0.01), (READ,), Sense.PLATE_MOVES,
                         {"other": 17}, "77", ("approach",))
 PROGRESS = ViewProgress(18, replace(READ.view, check_marks=4, check_offset_m=2e-5), 19, 20, 21, 22,
@@ -287,7 +287,7 @@ def test_fields_of_a_view_measurement_by_name():
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
         "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
         **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0, "artifact_from": "/r.json",
-        **NO_MARKS}
+        "axis_theta": 0.01, **NO_MARKS}
 
 
 def test_fields_of_a_view_status_by_name():

@@ -12,7 +12,7 @@ from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.collecting import START_NS, collect
 from test.support.mark_lists import listed_plan, rings, scatter
-from test.support.plans import placed_plan, plan_of
+from test.support.plans import harmonic_plan, placed_plan, plan_of
 from test.support.truth import simulate_measurements
 
 EVERYTHING = Spread(rotation="finite", encoder="independent", microscope_scale=5e-3,
@@ -36,6 +36,7 @@ CASES = {
 
 
 PLANS = {"on the lattice": plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3),
+         "harmonics": harmonic_plan(),
          "placed": placed_plan(7, size_y=5, count=8, repeats=3),
          "a list of marks": listed_plan(scatter(40, half_m=0.02, angular_count=8), repeats=3)}
 
@@ -60,6 +61,7 @@ def test_both_give_the_same_readings_visit_by_visit(plan, case, sense):
         for name in ("dx", "dy", "sigma_xy"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-17)
         np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
+        assert one.axis_theta == pytest.approx(other.axis_theta, abs=4e-15)
         np.testing.assert_allclose(one.sigma_theta, other.sigma_theta, rtol=1e-9)
         if one.view.grid:
             assert_same_visits(one.visits, other.visits)

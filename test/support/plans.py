@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans written as in the tables: '0, 90, tx', on any plate."""
 
-from math import pi
+import math
+from collections.abc import Sequence
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View, plan_from_dict
@@ -38,10 +39,10 @@ def plan_of(text: str, size: int = 5, *, count: int = 0, size_y: int = 0, line: 
     """Return the plan of views such as '0, 90, tx'; `line` adds the turn by one line."""
     artifact = Artifact(size, 0.01, count, size_y)
     names = [name.strip() for name in text.split(",")]
-    views = [View(name, POSES[name][0] * pi / 2, (POSES[name][1] * 0.01, POSES[name][2] * 0.01),
-                  True, count > 0, repeats) for name in names]
+    views = [View(name, q * math.pi / 2, (a * 0.01, b * 0.01), True, count > 0, repeats)
+             for name, (q, a, b) in ((name, POSES[name]) for name in names)]
     if line:
-        views.append(View("line", 2 * pi / count, (0.0, 0.0), False, True, repeats))
+        views.append(View("line", 2 * math.pi / count, (0.0, 0.0), False, True, repeats))
     return Plan(text, artifact, tuple(views))
 
 
@@ -59,6 +60,16 @@ def image_plan(size: int = 7, *, turns: tuple[float, ...] = (0, 90), count: int 
         "image": {"nx": marks, "ny": marks},
         "views": [{"name": f"{turn:g}", "rotation_deg": turn, "repeats": repeats}
                   for turn in turns] + lines}, "image plan")
+
+
+def harmonic_plan(count: int = 24, harmonics: int = 8, turns_deg: Sequence[float] = (37, 101),
+                  size: int = 5) -> Plan:
+    """Return {0, 90, tx} of marks, with lines at 0 and in views of their own at other turns."""
+    plate, quarter = Artifact(size, 0.01, count, harmonics=harmonics), math.pi / 2
+    return Plan("rotary", plate, (
+        View("first"), View("quarter", quarter, angular=False),
+        View("shift", 0.0, (0.01, 0.0), angular=False),
+        *(View(f"{turn}deg", math.radians(turn), grid=False) for turn in turns_deg)))
 
 
 def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1) -> Plan:

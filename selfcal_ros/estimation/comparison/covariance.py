@@ -242,7 +242,9 @@ def _read_system(result: CalibrationResult) -> NormalEquations:
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
         if weight.any():
-            lines.append((index, pose.turn_lines or 0, weight))
+            turned = v.phi if artifact.harmonics and np.isfinite(v.phi) else 0.0
+            turned *= artifact.angular_count / (2 * np.pi)
+            lines.append((index, (pose.turn_lines or 0) + turned, weight))
         if in_grid:
             grid.append((index, pose, _weights(v.read_grid, in_field(pose, artifact), of_grid)))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),

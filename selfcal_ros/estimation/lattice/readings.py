@@ -100,7 +100,10 @@ class GridData:
 
 @dataclass(frozen=True, eq=False)
 class AngularData:
-    """Angular readings: like `GridData` on the circle, arrays (views, K), rad."""
+    """Angular readings: like `GridData` on the circle, arrays (views, K), rad.
+
+    With harmonics the turns are those of the axis where it stood.
+    """
 
     index: tuple[int, ...]
     turns: tuple[float, ...]
@@ -160,7 +163,8 @@ def angular_data(measurements: Measurements) -> AngularData:
         _place(y[row], weight[row], k, values=np.asarray(readings.dtheta),
                count=readings.count_theta, where=where)
         ones.append((k, readings.count_theta, readings.u_theta))
-        turns.append(turn)
+        about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
+        turns.append(turn + about if artifact.harmonics and about else turn)
     sigma = _declare(weight, ones)
     return AngularData(index, tuple(turns), y, weight, sigma, artifact.harmonics)
 

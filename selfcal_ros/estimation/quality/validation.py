@@ -252,7 +252,8 @@ def prediction_errors(measurements: Measurements, result: CalibrationResult, ind
         turn = pose_of(view.view, measurements.artifact).turn_lines or 0
         site, g = sign * (view.k + turn) % count, result.error_map.g_theta
         if harmonics := measurements.artifact.harmonics:
-            g_theta = Circle(g, cubic=False, harmonics=harmonics).at(site * (2 * np.pi / count))
+            g_theta = Circle(g, cubic=False, harmonics=harmonics).at(
+                site * (2 * np.pi / count) + sign * view.axis_theta)
         else:
             g_theta = g[site]
         theta = (view.dtheta - sign * g_theta
