@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what was read is the known plate, placed as planned (method eq. 13.4).
+"""Whether what was read is the known plate, placed as planned (method eq. 13.5).
 
 With the stage as it was, the readings of a view less both known maps leave motion, strain and
 noise. A wrong pose or another plate leaves differences of marks instead: unlike a change of the
 stage, they have nothing in common from one mark to the next.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +15,15 @@ from selfcal_ros.estimation.checks.placing import (
     CLEARLY,
     CONTRADICTED,
     LEAST_READINGS,
+    ON_MARKS,
     Misplaced,
+    motions,
+    on_marks,
     said,
 )
 from selfcal_ros.estimation.recheck.change import KnownPlate, rows_at
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import rms
-from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.verdict import Finding
 
@@ -38,6 +39,12 @@ LEAST = 0.01
 STEPS = 6
 """Steps to the motion of a view by least absolute values."""
 
+NEIGHBOURS = 1.3
+"""Largest distance of neighbouring marks, in pitches."""
+
+PLANNED = (1 + 0j, 0j)
+"""No further turn, no further shift."""
+
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a vector whose two components have the standard deviation 1."""
 
@@ -52,18 +59,16 @@ class _Read:
     shift: complex
     u: float
 
-    def left(self, plate: np.ndarray, artifact: Artifact, pose: tuple[int, complex],
+    def left(self, plate: np.ndarray, artifact: Artifact, pose: tuple[complex, complex],
              ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return what the known plate leaves, and of which readings; None if they are not on it.
 
-        `pose`: further quarter turns, and shift of the plate's centre, in its pitches.
+        `pose`: factor of a further turn, and shift of the plate's centre, in its pitches.
         """
-        mark = 1j ** -pose[0] * (self.marks - pose[1])
-        i, j = (np.rint(part).astype(int) + half for part, half in zip(
-            (mark.real, mark.imag), artifact.half, strict=True))
-        if ((i < 0) | (i >= artifact.shape[0]) | (j < 0) | (j >= artifact.shape[1])).any():
+        mark, there = on_marks(artifact, (self.marks - pose[1]) / pose[0])
+        if there.mean() < ON_MARKS:
             return None
-        rest = self.offsets - self.turn * 1j ** pose[0] * plate[i, j]
+        rest = self.offsets - self.turn * pose[0] * np.where(there, plate.flat[mark], np.nan)
         here = np.isfinite(rest)
         if here.sum() < LEAST_READINGS:
             return None
@@ -75,15 +80,6 @@ class _Read:
                 weight * free, weight[:, 0] * rest[here], rcond=None)[0]
             weight = np.maximum(abs(left), self.u)[:, None] ** -0.5
         return left, here
-
-    def poses(self) -> Iterator[tuple[int, complex]]:
-        """Yield other poses that have the marks where they are planned."""
-        t, turn = self.shift, self.turn
-        centres = [t, *(t + turn * step for step in (1, -1, 1j, -1j)), 0, -t, 1j * t, -1j * t]
-        steps = {complex(np.round(step)) for step in ((centre - t) / turn for centre in centres)
-                 if abs(step - np.round(step)) < EDGE}
-        yield from ((q, step) for step in sorted(steps, key=lambda s: (s.real, s.imag))
-                    for q in range(4) if q or step)
 
 
 def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> Finding | None:
@@ -107,7 +103,7 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
     """
     for view in (one for one in measurements.views if one.view.cell in (None, (0, 0))):
         seen = _read(view, measurements, plate, sigma)
-        planned = None if seen is None else seen.left(plate.field, measurements.artifact, (0, 0j))
+        planned = None if seen is None else seen.left(plate.field, measurements.artifact, PLANNED)
         if seen is None or planned is None:
             continue
         rest, here = planned
@@ -136,18 +132,20 @@ def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
     u = [sigma / np.sqrt(view.count.mean()), rms(np.stack([old.u_gx, old.u_gy])),
          rms(np.stack([marks.u_ax, marks.u_ay])), LEAST * rms(np.stack([marks.ax, marks.ay]))]
     offsets = np.where(there, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
-    return _Read(view.m + 1j * view.n, offsets, complex(np.exp(1j * view.view.rotation_rad)),
+    x, y = artifact.places(view.m, view.n)
+    return _Read(x + 1j * y, offsets, complex(np.exp(1j * view.view.rotation_rad)),
                  complex(*view.view.translation_m) / pitch, float(np.linalg.norm(u)))
 
 
-def _other_pose(seen: _Read, plate: np.ndarray, artifact: Artifact) -> tuple[int, complex] | None:
+def _other_pose(seen: _Read, plate: np.ndarray,
+                artifact: Artifact) -> tuple[complex, complex] | None:
     """Return the pose that explains the readings much better than the planned one; else None.
 
     By the gain of the log-likelihood of differences of unknown size.
     """
     tried = []
-    for pose in seen.poses():
-        here, planned = (seen.left(plate, artifact, each) for each in (pose, (0, 0j)))
+    for pose in motions(artifact, seen.turn, seen.shift):
+        here, planned = (seen.left(plate, artifact, each) for each in (pose, PLANNED))
         if here is None or planned is None:
             continue
         before, after = (max(_size(rest), seen.u) for rest, _ in (planned, here))
@@ -164,18 +162,19 @@ def _size(rest: np.ndarray) -> float:
     return float(np.median(np.abs(rest))) / RAYLEIGH_MEDIAN
 
 
-def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[int, complex]) -> Misplaced:
+def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -> Misplaced:
     """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
     deg, moved = np.degrees(view.view.rotation_rad), seen.shift + seen.turn * pose[1]
     planned, found = (tuple(float(np.round(part, 6)) for part in (at.real, at.imag))
                       for at in (seen.shift, moved))
-    return Misplaced(view.view.name, round(float(deg) % 360, 6),
-                     round(float(deg + 90 * pose[0]) % 360, 6), (planned[0], planned[1]),
-                     (found[0], found[1]))
+    turned = deg + np.degrees(np.angle(pose[0]))
+    return Misplaced(view.view.name, round(float(deg) % 360, 6), round(float(turned) % 360, 6),
+                     (planned[0], planned[1]), (found[0], found[1]))
 
 
 def _neighbours(marks: np.ndarray, rest: np.ndarray) -> float:
     """Return the correlation of what is left at neighbouring marks."""
-    first, other = np.nonzero(np.abs(np.abs(marks[:, None] - marks) - 1) < EDGE)
+    away = np.abs(marks[:, None] - marks)
+    first, other = np.nonzero((away > 0) & (away < NEIGHBOURS))
     products = (rest[first] * rest[other].conj()).real
     return float(products.mean() / np.mean(np.abs(rest)**2)) if len(products) else 1.0

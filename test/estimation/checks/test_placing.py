@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plates that lie otherwise than planned: told by the errors that marks carry along, and by ids."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import collect, gathered, scene
-from test.support.misplaced import NOISE, laid
+from test.support.mark_lists import lattice, rings, scatter
+from test.support.misplaced import NOISE, laid, laid_at
+from test.support.placed import SIX, plate
 from test.support.plans import plan_of
 
 WRONG = {  # what the plan says, where the plate lies, in which view, and what is said
@@ -87,3 +90,27 @@ def test_other_poses_are_turns_and_shifts_each_once():
     assert len(poses) == len(set(poses)) and (0, (1, 0)) not in poses
     assert {(1, (1, 0)), (2, (1, 0)), (3, (1, 0)), (0, (0, 0)), (0, (-1, 0)), (0, (0, 1)),
             (0, (0, -1)), (0, (2, 0)), (0, (1, 1)), (0, (1, -1))} == set(poses)
+
+
+PLATES = {"lattice": plate(9, 5), "list": lattice(7), "rings": rings(), "scatter": scatter()}
+
+
+@pytest.mark.parametrize(("name", "index", "pose", "said"), [
+    ("lattice", 1, (270, (0, 0)), "turned by 270°, not by 90°"),
+    ("lattice", 2, (127, (0.6, -0.7)), "turned by 127°, not by 37°"),
+    ("lattice", 4, (0, (0, 0)), "shifted by (+0, +0) pitches, not by (+1, +0)"),
+    ("list", 1, (0, (0, 0)), "turned by 0°, not by 90°"),
+    ("list", 4, (0, (-1, 0)), "shifted by (-1, +0) pitches, not by (+1, +0)"),
+    ("rings", 2, (217, (0.6, -0.7)), "turned by 217°, not by 37°")])
+def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
+        name, index, pose, said):
+    for seed in range(3):
+        with pytest.raises(PlacingError, match=re.escape(f"'view {index}': the plate lies {said}")):
+            calibrate(laid_at(PLATES[name], index, pose, seed))
+
+
+@pytest.mark.parametrize("name", PLATES)
+@pytest.mark.parametrize("sigma", [20e-9, 1e-9])
+def test_plates_off_the_lattice_that_lie_as_planned_are_no_finding(name, sigma):
+    for seed in range(5):
+        assert misplaced(laid_at(PLATES[name], 1, SIX[1], seed, sigma)) is None
