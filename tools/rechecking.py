@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A population of machines rechecked: type I error, detection, coverage.
 
-.venv/bin/python -m tools.rechecking [--machines N] [--first SEED] [--size K] [--workers N]
+.venv/bin/python -m tools.rechecking [--machines N] [--size K] [--nodes N]
 
 Each machine is calibrated, then seen in one more view of the same plate. Half of the machines have
-changed meanwhile: three nodes of the map by K times their standard uncertainty (default: 3).
+changed meanwhile: N nodes of the map (default: 3) by K times its standard uncertainty (default: 3),
+or with 0 nodes all of them smoothly, by K times in the mean (rms).
 """
 
 import argparse
@@ -16,13 +17,15 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
-from selfcal_ros.model.error_map import datum_modes, remove_modes
+from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.parallel import check_workers, outcomes
 
 PITCH_M, SIGMA_M, SIGMA_RAD, SIZE_M, TURN_RAD = 0.01, 20e-9, 2e-6, 0.3e-6, 1e-4
-NODES = 3
+LENGTH = 0.3
+"""Correlation length of a smooth change, as a part of the width of the field."""
+
 MAPS = {"lattice": Artifact(11, PITCH_M, 12), "lattice six": Artifact(11, PITCH_M, 12),
         "general six": Artifact(11, PITCH_M, 0, map_grid=MapGrid(7, PITCH_M * 10 / 6))}
 PLANS = {
@@ -35,11 +38,12 @@ PLANS = {
 
 @dataclass(frozen=True)
 class Case:
-    """A machine: how its plate is calibrated, its seed, and the change of a node over its u."""
+    """A machine: how its plate is calibrated, its seed, the change over u, and its nodes."""
 
     plan: str
     seed: int
     size: float
+    nodes: int = 3
 
 
 def complex_normal(rng: np.random.Generator, shape: tuple[int, ...], size: float) -> np.ndarray:
@@ -82,6 +86,17 @@ class Machine:
                        count=np.ones(len(m), dtype=int))
 
 
+def smooth(field: Artifact, rng: np.random.Generator) -> np.ndarray:
+    """Return a smooth random map without motion and scale, rms 1 of each coordinate."""
+    z = (field.x_m + 1j * field.y_m).ravel()
+    near = np.exp(-np.abs(z[:, None] - z) ** 2 / (2 * (LENGTH * np.ptp(field.x_m)) ** 2))
+    values, vectors = np.linalg.eigh(near)
+    drawn = (vectors * np.sqrt(np.maximum(values, 0))) @ complex_normal(rng, z.shape, 1.0)
+    xy = np.stack([drawn.real, drawn.imag]).reshape(2, *field.shape)
+    xy = remove_modes(xy, datum_modes(field, scale=True))
+    return (xy[0] + 1j * xy[1]) / rms(xy)
+
+
 def run(case: Case) -> tuple[bool, bool, float, float]:
     """Return whether a machine's results are qualified, and it is said to have changed.
 
@@ -101,7 +116,9 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
         machine.read(view, rng) for view in views)), Options())
     field = machine.field.copy()
     known = np.flatnonzero(before.error_map.valid)
-    for node in rng.choice(known, NODES, replace=False) if case.size else ():
+    if case.size and not case.nodes:
+        field += case.size * rms(before.error_map.u_gx) * smooth(artifact.field, rng)
+    for node in rng.choice(known, case.nodes, replace=False) if case.size else ():
         u = float(before.error_map.u_gx.flat[node])
         field.flat[node] += case.size * u * np.exp(2j * np.pi * rng.random())
     today = replace(machine, field=field)
@@ -123,12 +140,13 @@ def main() -> int:
     parser.add_argument("--machines", type=int, default=200, help="of each plan (default: 200)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first (default: 0)")
     parser.add_argument("--size", type=float, default=3.0, help="of a change, over u (default: 3)")
+    parser.add_argument("--nodes", type=int, default=3, help="changed; 0 = all (default: 3)")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     args = parser.parse_args()
     print("| calibration | machines | qualified | said to have changed: not changed, changed | "
           "new map in U | error / u |\n|---|---|---|---|---|---|")
     for plan in PLANS:
-        cases = [Case(plan, args.first + i // 2, args.size * (i % 2))
+        cases = [Case(plan, args.first + i // 2, args.size * (i % 2), args.nodes)
                  for i in range(args.machines)]
         found: list = [None] * len(cases)
         for outcome in outcomes(run, cases, workers=check_workers(args.workers)):

@@ -22,6 +22,7 @@ from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.comparison.together import Together, together
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.placed import MapSpline
+from selfcal_ros.estimation.recheck.detection import ChangeTests
 from selfcal_ros.estimation.recheck.views import Gain
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
@@ -198,21 +199,22 @@ class Change:
         The change and its standard uncertainty, (2, nx, ny) in m, or (K,) in rad; NaN if unknown.
     test : Significance or None
         Its significance.
+    p : float
+        Probability of as large a change if there is none.
     scale, u_scale, p_scale : float
         Change of the scale against the plate, m/m.
+    tests : ChangeTests or None
+        Tests of the XY map.
     """
 
     values: np.ndarray
     u: np.ndarray
     test: Significance | None
+    p: float = 1.0
     scale: float = float("nan")
     u_scale: float = float("nan")
     p_scale: float = float("nan")
-
-    @property
-    def p(self) -> float:
-        """Probability of as large a change if there is none: both tests together."""
-        return 1.0 if self.test is None else min(2 * min(self.test.p, self.test.p_z), 1.0)
+    tests: ChangeTests | None = None
 
     @property
     def worst(self) -> tuple[int, ...]:
@@ -246,16 +248,20 @@ def map_change(new: NewMap, plate: KnownPlate) -> Change:
     modes = datum_modes(new.artifact, scale=True).reshape(4, -1).T[here]
     basis = modes if plate.result.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
-    rest = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
     cover = of_new + of_old
+    z = (new.artifact.x_m + 1j * new.artifact.y_m)[common]
+    tests = ChangeTests(z, cover, basis, dof)
+    rest = tests.without(values)
     test = significance(rest, [(cover, True)], basis, dof)
     part = scale_row(modes)
     scale, u_scale = float(part @ values), float(np.sqrt(part @ cover @ part))
     out = np.full((2, 2 * new.known.size), np.nan)
     out[:, here] = rest, _u_without(cover, basis)
     shape = (2, *new.known.shape)
-    return Change(out[0].reshape(shape), out[1].reshape(shape), test, scale, u_scale,
-                  2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)))
+    return Change(out[0].reshape(shape), out[1].reshape(shape), test,
+                  1.0 if test is None else tests.p(rest), scale, u_scale,
+                  2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
+                  None if test is None else tests)
 
 
 def scale_row(modes: np.ndarray) -> np.ndarray:
@@ -350,7 +356,8 @@ def line_change(new: NewLines, plate: KnownPlate) -> Change:
     basis = np.ones((len(values), 1))
     values = values - values.mean()
     out[:, here] = values, _u_without(of_new + of_old, basis)
-    return Change(out[0], out[1], significance(values, [(of_new + of_old, True)], basis, dof))
+    test = significance(values, [(of_new + of_old, True)], basis, dof)
+    return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
 def record(change: Change, lines: Change, artifact: Artifact, of: str) -> dict[str, Any]:
@@ -368,6 +375,8 @@ def record(change: Change, lines: Change, artifact: Artifact, of: str) -> dict[s
         "scale": {"changed": bool(change.p_scale < DIFFERENCE_LEVEL), "change": change.scale,
                   "u": change.u_scale, "p": change.p_scale},
         "dx": change.values[0], "dy": change.values[1], "u_dx": change.u[0], "u_dy": change.u[1]}
+    if change.tests is not None:
+        found["detectable"] = change.tests.found(DIFFERENCE_LEVEL / len(parts))
     if lines.test is not None:
         line = lines.worst[0]
         found |= {"p_theta": lines.p, "significance_theta": asdict(lines.test),

@@ -134,6 +134,10 @@ def recheck_lines(found: Mapping[str, Any]) -> list[str]:
     scale = found["scale"]
     out = [f"XY     rms {found['rms'] * UM_PER_M:.5f} µm per axis, "
            f"u {found['u_rms'] * UM_PER_M:.5f} µm, p = {found['p_xy']:.2g}"]
+    if "detectable" in found:
+        sizes = {name: f"{size * UM_PER_M:.2g} µm" for name, size in found["detectable"].items()}
+        out.append(f"found  in 9 of 10 cases: {sizes['one_node']} at one node, or a smooth change "
+                   f"of {sizes['smooth']} rms per axis")
     if "p_theta" in found:
         line = found["largest_theta"]
         out.append(f"theta  most at line {line['line']}, by "

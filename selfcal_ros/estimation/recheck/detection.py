@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a map has changed, and how large a change is found (method eq. 13.4).
+
+Three statistics of the same change: one for a change at all nodes, one for a change at few, one for
+a smooth change. Draws of the change's noise give the probability of the most telling of the three.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc, i0e, stdtr
+
+from selfcal_ros.model.error_map import MANY_DOF, rms
+
+DRAWS = 2000
+"""Draws of the noise of a change; every other one tells how large a change is found."""
+
+FEW, LARGE = 3.0, 3.0
+"""Number of changed nodes, and their change in standard uncertainties, of the second statistic."""
+
+TAIL = 0.005
+"""Probability below which draws are too few, and a bound of it counts if that is smaller."""
+
+ORDER = 2
+"""Degree of the polynomials of the third statistic."""
+
+POWER = 0.9
+"""Part of the changes of the size stated as found that are found."""
+
+NO_VARIANCE = 1e-9
+"""Relative variance of a combination of nodes that the datum removes."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeTests:
+    """Statistics of changes of a map, Gx first, then Gy, free from the columns `removed`.
+
+    Attributes
+    ----------
+    places : complex array (n,)
+        Nodes, in any unit.
+    covariance : float array (2n, 2n)
+        Of a change, before the columns are removed, m^2.
+    removed : float array (2n, k)
+        What the datum removes by least squares.
+    dof : float
+        Degrees of freedom of the noise behind the covariance.
+    """
+
+    places: np.ndarray
+    covariance: np.ndarray
+    removed: np.ndarray
+    dof: float
+
+    def without(self, values: np.ndarray) -> np.ndarray:
+        """Return values (2n, ...) without the columns `removed`."""
+        q = np.linalg.qr(self.removed)[0]
+        return values - q @ (q.T @ values)
+
+    @cached_property
+    def _own(self) -> np.ndarray:
+        """Covariance of a change, (2n, 2n)."""
+        return self.without(self.without(self.covariance).T)
+
+    @cached_property
+    def u(self) -> np.ndarray:
+        """Standard uncertainty of a change, (2n,), m."""
+        variance = np.diag(self._own)
+        return np.sqrt(np.maximum(variance, NO_VARIANCE * variance.max()))
+
+    @cached_property
+    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations (r,) and axes (2n, r) of the change over `u`."""
+        values, vectors = np.linalg.eigh(self._own / np.outer(self.u, self.u))
+        told = values > NO_VARIANCE * values[-1]
+        return np.sqrt(values[told]), vectors[:, told]
+
+    @cached_property
+    def _smooth(self) -> np.ndarray:
+        """Orthonormal polynomials of both coordinates that are free from `removed`, (2n, k)."""
+        z = self.places / np.abs(self.places).max()
+        columns = np.stack([z.real**i * z.imag**j for i in range(ORDER + 1)
+                            for j in range(ORDER + 1 - i)], axis=1)
+        found, size, _ = np.linalg.svd(self.without(np.kron(np.eye(2), columns)),
+                                       full_matrices=False)
+        return found[:, size > np.sqrt(NO_VARIANCE) * size[0]]
+
+    @cached_property
+    def _whiten_smooth(self) -> np.ndarray:
+        """Rows from a change to its polynomials, of variance 1 and independent, (k, 2n)."""
+        factor = np.linalg.cholesky(self._smooth.T @ self._own @ self._smooth)
+        return np.linalg.solve(factor, self._smooth.T)
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Return the three statistics of changes (2n, draws), (3, draws)."""
+        size, axes = self._axes
+        ratio = values / self.u[:, None]
+        few = np.hypot(*ratio.reshape(2, -1, ratio.shape[1]))
+        part = FEW / len(few)
+        likelier = np.logaddexp(np.log1p(-min(part, 0.5)), np.log(part) + LARGE * few
+                                - LARGE**2 / 2 + np.log(i0e(LARGE * few)))
+        return np.stack([((axes.T @ ratio / size[:, None]) ** 2).sum(axis=0),
+                         likelier.sum(axis=0), ((self._whiten_smooth @ values) ** 2).sum(axis=0)])
+
+    @cached_property
+    def _noise(self) -> np.ndarray:
+        """Changes that are noise only, (2n, DRAWS), m."""
+        rng, (size, axes) = np.random.default_rng(0), self._axes
+        drawn = (self.u[:, None] * axes * size) @ rng.standard_normal((len(size), DRAWS))
+        return drawn if self.dof > MANY_DOF else drawn / np.sqrt(
+            rng.chisquare(self.dof, DRAWS) / self.dof)
+
+    @cached_property
+    def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
+        """Statistics of noise, each in order, (3, DRAWS), and the least rank from above, sorted."""
+        found = self.of(self._noise)
+        ranks = DRAWS - np.argsort(np.argsort(found, axis=1), axis=1)
+        return np.sort(found, axis=1), np.sort(ranks.min(axis=0))
+
+    def p(self, values: np.ndarray) -> float:
+        """Return the probability of as telling a change, (2n,), if there is none."""
+        found, (drawn, least) = self.of(values[:, None])[:, 0], self._drawn
+        rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
+                   for row, one in zip(drawn, found, strict=True))
+        p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
+        return float(p) if p > TAIL else min(float(p), self._bound(values, found))
+
+    def _bound(self, values: np.ndarray, found: np.ndarray) -> float:
+        """Return a bound of the probability, close where it is small (Bonferroni)."""
+        dof, n = min(self.dof, MANY_DOF), len(self.u)
+        each = [2 * n * float(stdtr(dof, -np.abs(values / self.u).max()))]
+        for square, free in ((found[0], len(self._axes[0])), (found[2], self._smooth.shape[1])):
+            each.append(float(fdtrc(free, dof, square / free) if self.dof <= MANY_DOF
+                              else chdtrc(free, square)))
+        return min(3 * min(each), 1.0)
+
+    def found(self, level: float) -> dict[str, float]:
+        """Return the changes, m, of which POWER are found if the tests have a level.
+
+        At one node, any node and direction; and rms of a smooth one, any polynomial.
+        """
+        drawn, least = self._drawn
+        rank = int(least[max(int(level * DRAWS) - 1, 0)])
+        limits = drawn[:, -rank][:, None]
+        rng, noise = np.random.default_rng(1), self._noise[:, ::2]
+        n, number = len(self.places), np.arange(noise.shape[1])
+        at, turn = rng.integers(n, size=len(number)), 2 * np.pi * rng.random(len(number))
+        one = np.zeros(noise.shape)
+        one[at, number], one[at + n, number] = np.cos(turn), np.sin(turn)
+        smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
+        smooth /= np.sqrt((smooth**2).mean(axis=0))
+        return {name: self._size(self.without(shape), noise, limits)
+                for name, shape in (("one_node", one), ("smooth", smooth))}
+
+    def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
+        """Return the size of a change of given shape of which POWER are found, by bisection."""
+        low, high = 0.0, 20 * rms(self.u)
+        for _ in range(10):
+            size = (low + high) / 2
+            enough = (self.of(noise + size * shape) >= limits).any(axis=0).mean() >= POWER
+            low, high = (low, size) if enough else (size, high)
+        return high
