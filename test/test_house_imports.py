@@ -102,9 +102,6 @@ def test_a_folder_holds_few_modules(folder):
 
 @pytest.mark.parametrize("path", SOURCES, ids=dotted)
 def test_imports_in_functions_state_their_reason(path):
-    """Verbs import late, so that ``selfcal --help`` does not load numpy: cli/ need not say so."""
-    if path.relative_to(PACKAGE).parts[0] == "cli":
-        return
     lines = source(path).text.splitlines()
     for node in source(path).late:
         line = lines[node.lineno - 1]

@@ -2,16 +2,20 @@
 """``selfcal apply``: commands for true positions, or true positions of indicated ones."""
 
 import argparse
-from typing import TYPE_CHECKING
+import sys
 
-from selfcal_ros.cli.terminal import add_json, say
+import numpy as np
 
-if TYPE_CHECKING:
-    import numpy as np
+from selfcal_ros.apply import StageMap, load
+from selfcal_ros.cli.terminal import add_json, exit_code, say
+from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import csv_cells, read_text
+from selfcal_ros.model.error_map import rms
+from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.units import UM_PER_M
 
-    from selfcal_ros.apply import StageMap
-
-HELP = "correct a table of positions: commands for true positions, or the inverse"
 AXES = ("x", "y", "theta")
 ENDS = ("x1", "y1", "x2", "y2")
 
@@ -41,14 +45,6 @@ def run(args: argparse.Namespace) -> int:
 
     A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
     """
-    import sys
-
-    from selfcal_ros.apply import load
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import outputs_of, record
-    from selfcal_ros.files import read_text
-    from selfcal_ros.outputs import check_outputs, write_text
-
     check_outputs([args.result, args.points], outputs_of(args))
     stage = load(args.result, method=args.method, outside=args.outside)
     points = read_points(read_text(args.points), args.points)
@@ -74,14 +70,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
     """Say that bicubic interpolation is worth more, if it halves most of u between the nodes."""
-    import sys
-
-    import numpy as np
-
-    from selfcal_ros.compensation.compensator import Compensator
-    from selfcal_ros.model.error_map import rms
-    from selfcal_ros.units import UM_PER_M
-
     emap, used = stage.error_map, rms(stage.halfway)
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
@@ -103,11 +91,6 @@ def read_points(text: str, where: str) -> "np.ndarray":
     InputError
         For another header, or a line that is not as many finite numbers.
     """
-    import numpy as np
-
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import csv_cells
-
     rows = [(number, csv_cells(line, f"{where}:{number}"))
             for number, line in enumerate(text.splitlines(), 1) if line.strip(", ")]
     head = [cell.lower() for cell in rows[0][1]] if rows else []
@@ -130,8 +113,6 @@ def read_points(text: str, where: str) -> "np.ndarray":
 
 def corrected(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
     """Return the table of corrected points, and how many are unknown and outside the field."""
-    import numpy as np
-
     names, what = AXES[:points.shape[1]], "true" if inverse else "command"
     x, y, *theta = points.T
     found = list(stage.correct(x, y) if inverse else stage.command(x, y))
@@ -149,13 +130,6 @@ def corrected(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tupl
 
 def distances(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
     """Return the table of distances with their errors, as `corrected`; and a line over length."""
-    import sys
-
-    import numpy as np
-
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.units import UM_PER_M
-
     if inverse:
         raise InputError("--inverse", "the ends of distances are true positions", "leave it out")
     x1, y1, x2, y2 = points.T

@@ -6,17 +6,34 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from selfcal_ros.batch.course import compared, sentence
+from selfcal_ros.batch.folder import (
+    Job,
+    Record,
+    Settings,
+    done_and_to_do,
+    find_bags,
+    kept_records,
+    opened,
+)
+from selfcal_ros.batch.jobs import run_job
+from selfcal_ros.batch.table import (
+    batch_json,
+    csv_text,
+    page_html,
+    series_of,
+    summary_lines,
+)
 from selfcal_ros.cli.solve import add_options, parameters
-from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import write_json, write_text
+from selfcal_ros.parallel import begin, check_workers, outcomes
+from selfcal_ros.results import read_result
 
-if TYPE_CHECKING:
-    from selfcal_ros.batch.folder import Job, Record, Settings
-    from selfcal_ros.model.result import CalibrationResult
-
-HELP = "calibrate from many bags on all cores: one table, trends and changes over time"
 LOCAL = "local"
 
 
@@ -42,12 +59,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve the remaining bags, write the table and the page, print a summary."""
-    from selfcal_ros.parallel import begin, check_workers
-
     if not args.dask:  # first: the modules of the workers load in parallel
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
-    from selfcal_ros.batch.folder import Settings, done_and_to_do, find_bags, kept_records, opened
-    from selfcal_ros.outputs import write_json, write_text
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
@@ -64,20 +77,11 @@ def run(args: argparse.Namespace) -> int:
         for record in (done[index] for index in sorted(done)):
             _say(record)
         done |= _worked(args, bags, settings, places)
-        from selfcal_ros.batch.table import (
-            batch_json,
-            csv_text,
-            page_html,
-            series_of,
-            summary_lines,
-        )
 
         records = [done[index] for index in sorted(done)]
         keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
         before = sum("key" in record and record["key"] in keys for record in records)
         if baseline is not None:
-            from selfcal_ros.batch.course import compared, sentence
-
             records = compared(records, folder, baseline, args.baseline)
         found = series_of(records)
         lines = summary_lines(records, found, before)
@@ -96,7 +100,6 @@ def _baseline(file: str | None) -> "CalibrationResult | None":
     """Return the map to compare with, None if there is none to be."""
     if file is None:
         return None
-    from selfcal_ros.results import read_result
 
     return read_result(file)
 
@@ -104,10 +107,6 @@ def _baseline(file: str | None) -> "CalibrationResult | None":
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
-    from selfcal_ros.batch.folder import Job
-    from selfcal_ros.cli.terminal import late_progress
-    from selfcal_ros.parallel import check_workers, outcomes
-
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
     folder = Path(args.output).absolute()
@@ -125,14 +124,11 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
 
 def _work_on(job: "Job") -> "Record":
-    from selfcal_ros.batch.jobs import run_job  # slow to load, and loaded in a worker already
-
     return run_job(job)
 
 
 def _load_table() -> None:
     """Load the modules for the table: with SciPy's statistics it takes longer than a bag."""
-    import selfcal_ros.batch.table  # noqa: F401
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:

@@ -6,22 +6,29 @@ import json
 import math
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from selfcal_ros.aerotech import export
+from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
+from selfcal_ros.aerotech.read import load_cal, read_cal, refuse_errors
+from selfcal_ros.aerotech.rules import Gi4
+from selfcal_ros.aerotech.verify import controller_figure, plane_correction, setup_of, verify_tables
+from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
 from selfcal_ros.cli import cal_lines
-from selfcal_ros.cli.terminal import add_json, busy, say
+from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
+from selfcal_ros.cli.trace import command, record, records_of
+from selfcal_ros.compensation.export import fill_unknown, provenance
+from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
+from selfcal_ros.compensation.residual import Correction, Residual, combined
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
-if TYPE_CHECKING:
-    from selfcal_ros.aerotech.evaluate import MachineSetup
-    from selfcal_ros.aerotech.model import Table1D, Table2D
-    from selfcal_ros.compensation.frame import MachineFrame
-    from selfcal_ros.compensation.residual import Correction, Residual
-    from selfcal_ros.model.result import CalibrationResult
-
-HELP = "read, check, evaluate, write and verify calibration files of Aerotech controllers"
 SCANNER_BITS = 16
 
 
@@ -73,10 +80,6 @@ def add_files(group: argparse._SubParsersAction) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech.model import Severity
-    from selfcal_ros.aerotech.read import read_cal, refuse_errors
-    from selfcal_ros.aerotech.rules import Gi4
-
     if args.scanner_bits is not None and not args.gi4:
         raise InputError("--scanner-bits", "it belongs to a GI4", "add --gi4")
     bits = SCANNER_BITS if args.scanner_bits is None else args.scanner_bits
@@ -116,10 +119,6 @@ def _described(table: "Table1D | Table2D") -> dict:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.aerotech.read import load_cal
-    from selfcal_ros.compensation.frame import frame_from_comments
-
     cal = load_cal(args.file)
     frame = frame_from_comments(cal.comments)
     unit = args.unit or (frame.unit if frame else "mm")
@@ -137,8 +136,6 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> "MachineSetup":
-    from selfcal_ros.aerotech.evaluate import AxisSetup, MachineSetup
-
     if args.temperature is not None and not math.isfinite(args.temperature):
         raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")
     directions = cal_lines.pairs(args.home_direction, "--home-direction")
@@ -188,14 +185,6 @@ def add_maps(group: argparse._SubParsersAction) -> None:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech import export
-    from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import command, record, records_of
-    from selfcal_ros.compensation.export import provenance
-    from selfcal_ros.compensation.residual import combined
-    from selfcal_ros.outputs import check_outputs
-
     frame = cal_lines.frame_of(args)
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
@@ -240,11 +229,6 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     NotIdentifiableError
         If the measured plan does not identify the stage.
     """
-    from dataclasses import replace
-
-    from selfcal_ros.compensation.export import fill_unknown
-    from selfcal_ros.results import read_result
-
     result, filled = read_result(args.result), 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
@@ -261,10 +245,6 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
     """Return the correction by the file of ``--onto``."""
-    from selfcal_ros.aerotech.evaluate import CalEvaluator
-    from selfcal_ros.aerotech.read import load_cal
-    from selfcal_ros.aerotech.verify import plane_correction, setup_of
-
     if args.onto is None:
         return None
     tables = CalEvaluator(load_cal(args.onto).tables, setup_of(frame))
@@ -275,12 +255,6 @@ def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | No
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech.model import Table2D
-    from selfcal_ros.aerotech.read import load_cal
-    from selfcal_ros.aerotech.verify import verify_tables
-    from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
-    from selfcal_ros.results import read_result
-
     result, cal = read_result(args.result), load_cal(args.file)
     base = frame_from_comments(cal.comments)
     if base is None and isinstance(cal.tables[0], Table2D):
@@ -290,8 +264,7 @@ def _verify(args: argparse.Namespace) -> int:
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
     say(args, residual_text(found.residuals), figures_of(found.residuals))
     if args.plot:
-        from selfcal_ros.aerotech.verify import controller_figure
-        from selfcal_ros.reporting.figures.paper import save_picture
+        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
         save_picture(controller_figure(found), args.plot)
     if found.worse:
         raise InputError(args.file, "the tables make the machine worse",
@@ -301,8 +274,6 @@ def _verify(args: argparse.Namespace) -> int:
 
 def figures_of(residuals: "list[Residual]") -> dict:
     """Return the residuals as data, m and rad."""
-    from selfcal_ros.outputs import plain
-
     return plain({r.place: {"points": r.position.shape[1],
                             "before": {"rms": r.rms("before"), "max": r.largest("before")},
                             "after": {"rms": r.rms("after"), "max": r.largest("after")},

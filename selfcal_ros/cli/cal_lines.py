@@ -9,18 +9,27 @@ import json
 import math
 import re
 from collections.abc import Container
+from dataclasses import replace
+from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from selfcal_ros.cli.terminal import add_json, say, tell
+from selfcal_ros import __version__
+from selfcal_ros.aerotech import export as cal_lines
+from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
+from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
+from selfcal_ros.aerotech.write import cal_text, write_cal
+from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
+from selfcal_ros.cli.trace import command, outputs_of, record
+from selfcal_ros.compensation.export import origin_lines, verdict_lines
+from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.files import read_text
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import check_outputs
+from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
-
-if TYPE_CHECKING:
-    from selfcal_ros.aerotech.export import AxisCorrection
-    from selfcal_ros.compensation.frame import MachineFrame
-    from selfcal_ros.model.result import CalibrationResult
 
 Axis = Literal["x", "y"]
 _HOMES: dict[Literal["end", "middle", "middle-balanced"], str] = {
@@ -44,8 +53,6 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
 
 def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
-    from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
-
     found = {}
     for axis, text in pairs(texts, option).items():
         try:
@@ -113,10 +120,6 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
 
 def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "MachineFrame":
     """Return the frame described by the options, with `base` as default."""
-    from dataclasses import replace
-
-    from selfcal_ros.compensation.frame import LENGTHS_M, MachineFrame
-
     base = base or MachineFrame()
     changes: dict[str, Any] = {
         name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
@@ -197,10 +200,6 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 
 def _orthogonality(args: argparse.Namespace) -> int:
-    from selfcal_ros.aerotech import export as cal_lines
-    from selfcal_ros.compensation.frame import UNITS_M
-    from selfcal_ros.results import read_result
-
     frame = _frame(args)
     other: Axis = "y" if args.along == "x" else "x"
     measured = (args.measured, args.over, args.travel)
@@ -250,10 +249,6 @@ def _straightness(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace, corrected: Axis) -> int:
-    from selfcal_ros.aerotech import export as cal_lines
-    from selfcal_ros.files import read_text
-    from selfcal_ros.results import read_result
-
     frame, result = _frame(args), None
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(args, "measured errors, whose positions are the controller's own",
@@ -280,16 +275,6 @@ def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
 def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
              axes: tuple[Axis, Axis], result: "CalibrationResult | None" = None) -> int:
     """Write the table of a line to a file, or print it; `result` is that of its map."""
-    from datetime import UTC, datetime
-
-    from selfcal_ros import __version__
-    from selfcal_ros.aerotech.export import DECIMALS, line_table
-    from selfcal_ros.aerotech.write import cal_text, write_cal
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import command, outputs_of, record
-    from selfcal_ros.compensation.export import origin_lines, verdict_lines
-    from selfcal_ros.outputs import check_outputs
-
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
     comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
                 f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",

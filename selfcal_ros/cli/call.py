@@ -4,10 +4,10 @@
 import argparse
 import contextlib
 
+from selfcal_ros.cli.processes import ended_by_signals, eyes
 from selfcal_ros.cli.terminal import add_json, say
 from selfcal_ros.errors import ExitCode
 
-HELP = "ask the sequencer of a running cell: start, confirm, redo, skip or abort"
 REQUESTS = ("start", "confirm", "redo", "skip", "abort")
 
 
@@ -22,8 +22,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send the request, print the answer; exit code 2 if it was refused."""
-    from selfcal_ros.cli.processes import ended_by_signals, eyes
-
     with ended_by_signals(), contextlib.ExitStack() as stack:
         monitor = stack.enter_context(eyes(args.namespace))
         monitor.ask(args.request)

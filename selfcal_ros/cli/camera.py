@@ -2,20 +2,21 @@
 """``selfcal camera init``: size of the pixels, turn and mirror from a few moves of the stage."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
 from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from selfcal_ros.vision.camera_pose import CameraPose
-    from selfcal_ros.vision.exposures import ImageDetector
-
-HELP = "find the size of the pixels, turn and mirror of a camera"
+from selfcal_ros.files import read_bytes, write_yaml
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.units import M_PER_UM
+from selfcal_ros.vision.camera_pose import CameraPose, camera_pose
+from selfcal_ros.vision.exposures import ImageDetector
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -45,14 +46,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Follow the marks, print the camera, write the parameters."""
-    import math
-
-    from selfcal_ros.collection.settings.detector import DetectorSettings
-    from selfcal_ros.files import write_yaml
-    from selfcal_ros.model.readings import Sense
-    from selfcal_ros.vision.camera_pose import camera_pose
-    from selfcal_ros.vision.exposures import ImageDetector
-
     detector = ImageDetector(DetectorSettings.checked({
         "pixel_size": 1.0, "mark_size": float(args.mark_pixels), "mark": args.mark,
         "polarity": args.polarity}, "--mark-pixels"), "--mark-pixels")  # offsets in pixels
@@ -73,9 +66,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _text(found: "CameraPose", output: str) -> str:
-    import math
-
-    from selfcal_ros.units import M_PER_UM
 
     return (f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
             f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
@@ -88,10 +78,6 @@ def _text(found: "CameraPose", output: str) -> str:
 def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
             ) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a bag."""
-    import numpy as np
-
-    from selfcal_ros.bagio.images import ImageBag, encoder_track
-
     stamps, track = encoder_track(args.bag)
     exposed, images = [], []
     bag = ImageBag(Path(args.bag))
@@ -115,11 +101,6 @@ def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
 def _of_files(args: argparse.Namespace, detector: "ImageDetector",
               ) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a folder."""
-    import numpy as np
-
-    from selfcal_ros.bagio.images import read_positions
-    from selfcal_ros.files import read_bytes
-
     positions, images = [], []
     for number, row in enumerate(read_positions(args.positions, None)):
         found = detector.take_file(read_bytes(Path(args.bag) / row.file), row.file, number)

@@ -7,10 +7,11 @@ import os
 import subprocess
 from pathlib import Path
 
+from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
 from selfcal_ros.cli.terminal import add_json, put, tell
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
-
-HELP = "check a machine cell before its first calibration"
+from selfcal_ros.files import read_bytes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,10 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check the cell, print the results; exit code 5 if a check fails."""
-    from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
-    from selfcal_ros.collection.settings.estimator import read_plan
-    from selfcal_ros.files import read_bytes
-
     need_ros("")
     read_plan(args.plan)
     for option in ("settle", "patience"):

@@ -3,9 +3,13 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, say
-
-HELP = "write a digital calibration certificate: DCC 3.3.0 (XML)"
+from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
+from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.files import read_yaml
+from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.results import read_result
+from selfcal_ros.standards.dcc import certificate, is_traceable
+from selfcal_ros.standards.details import details_from_dict
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -25,14 +29,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read result and details, write the certificate."""
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import outputs_of, record
-    from selfcal_ros.files import read_yaml
-    from selfcal_ros.outputs import check_outputs, write_bytes
-    from selfcal_ros.results import read_result
-    from selfcal_ros.standards.dcc import certificate, is_traceable
-    from selfcal_ros.standards.details import details_from_dict
-
     check_outputs([args.result, args.details], outputs_of(args))
     result = read_result(args.result)
     details = details_from_dict(read_yaml(args.details), args.details)

@@ -5,18 +5,20 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.external import map_from_table
+from selfcal_ros.files import read_text
+from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.result import CalibrationResult, created_now, result_to_dict
+from selfcal_ros.outputs import check_outputs, write_json
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from selfcal_ros.estimation.comparison.combine import Part
-    from selfcal_ros.model.result import CalibrationResult
-
-HELP = "combine several calibrations of a stage to one map"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,11 +36,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Combine, write the mean map, print the deviation of each run."""
-    from selfcal_ros.estimation.comparison.combine import combine
-    from selfcal_ros.model.result import created_now, result_to_dict
-    from selfcal_ros.outputs import check_outputs, write_json
-    from selfcal_ros.reporting.words.findings import worded
-
     check_outputs(args.maps, [file_of(args)])
     parts = read_parts(args.maps)
     with busy("combining"):
@@ -57,12 +54,6 @@ def run(args: argparse.Namespace) -> int:
 
 def read_parts(names: Sequence[str]) -> list[Part]:
     """Return the maps of files; those of CSV files on the lattice of the first result."""
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.estimation.comparison.combine import Part
-    from selfcal_ros.estimation.comparison.external import map_from_table
-    from selfcal_ros.files import read_text
-    from selfcal_ros.results import read_result
-
     tables = [name for name in names if name.lower().endswith(".csv")]
     results = {name: read_result(name)
                for name in names if name not in tables}
@@ -75,8 +66,6 @@ def read_parts(names: Sequence[str]) -> list[Part]:
 
 
 def _text(result: CalibrationResult, found: dict[str, Any]) -> str:
-    from selfcal_ros.model.error_map import rms
-
     emap, noise = result.error_map, result.noise
     u = [rms(emap.u_gx), rms(emap.u_gy)]
     lines = [f"mean of {len(found['runs'])} maps: {result.verdict.sentence}",

@@ -3,19 +3,20 @@
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
+from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.solve import node_settings
 from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_bytes
+from selfcal_ros.outputs import write_bytes
+from selfcal_ros.vision.exposures import ImageDetector
 
-if TYPE_CHECKING:
-    from collections import Counter
-
-    from selfcal_ros.collection.settings.detector import DetectorSettings
-    from selfcal_ros.vision.exposures import ImageDetector
-
-HELP = "find the marks in the images of a bag"
 SHOWN = 5
 """Number of problems that are printed."""
 
@@ -58,8 +59,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def settings_of(args: argparse.Namespace) -> "DetectorSettings":
     """Return the settings in the arguments."""
-    from selfcal_ros.collection.settings.detector import DetectorSettings
-
     names = ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
     return node_settings(args.params, DetectorSettings,
                          **{name: getattr(args, name) for name in names})
@@ -67,12 +66,6 @@ def settings_of(args: argparse.Namespace) -> "DetectorSettings":
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    from selfcal_ros.bagio.images import ImageBag
-    from selfcal_ros.bagio.offline import TRUTH_FILE
-    from selfcal_ros.files import read_bytes
-    from selfcal_ros.outputs import write_bytes
-    from selfcal_ros.vision.exposures import ImageDetector
-
     settings = settings_of(args)
     detector = ImageDetector(settings, args.params or "options")
     if args.positions:
@@ -94,10 +87,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str) -> "Counter[str]":
     """Write a bag from image files and a table of positions; return problems."""
-    from selfcal_ros.bagio.images import read_positions, write_pictures
-    from selfcal_ros.collection.settings.estimator import read_plan
-    from selfcal_ros.errors import InputError
-
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
     plan = read_plan(args.plan)

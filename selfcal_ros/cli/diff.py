@@ -5,18 +5,27 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
-from selfcal_ros.cli.terminal import busy, say
+from selfcal_ros.cli.terminal import busy, say, say_unless_qualified
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.comparison.maps import (
+    LaserDifference,
+    MapDifference,
+    Significance,
+    compare,
+    compare_with_laser,
+)
+from selfcal_ros.estimation.comparison.together import plate_as_map
+from selfcal_ros.files import parse_json
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.reporting.figures.maps import difference_picture
+from selfcal_ros.reporting.summary.sections import enlargement_texts
+from selfcal_ros.results import read_result, result_bytes
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from selfcal_ros.estimation.comparison.maps import LaserDifference, MapDifference, Significance
-    from selfcal_ros.model.result import CalibrationResult
-
-HELP = "compare two results after removing the datum difference"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -35,13 +44,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
-    from selfcal_ros.cli.terminal import say_unless_qualified
-    from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
-    from selfcal_ros.files import parse_json
-    from selfcal_ros.outputs import check_outputs
-    from selfcal_ros.results import read_result, result_bytes
-
     check_outputs([args.a, args.b], [args.plot])
     a, (name, raw) = read_result(args.a), result_bytes(args.b)
     second = parse_json(raw, name)
@@ -68,9 +70,7 @@ def run(args: argparse.Namespace) -> int:
         found = compare(a, b, keep_scale=args.keep_scale, plates=args.artifact,
                         names=(args.a, args.b))
     if args.plot:
-        from selfcal_ros.estimation.comparison.together import plate_as_map
-        from selfcal_ros.reporting.figures.maps import difference_picture
-        from selfcal_ros.reporting.figures.paper import save_picture
+        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
         one, other = ((plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b))
         save_picture(difference_picture(one, other, {
@@ -89,8 +89,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
     """Return grade and enlargements of the results A and B."""
-    from selfcal_ros.outputs import plain
-
     named = dict(zip("ab", (result.verdict for result in results), strict=False))
     return plain({"grade": {name: str(verdict.grade) for name, verdict in named.items()},
                   "enlarged_by": {name: [vars(item) for item in verdict.enlarged_by]
@@ -98,18 +96,12 @@ def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
 
 
 def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
-    from selfcal_ros.reporting.summary.sections import enlargement_texts
-
     return [f"{name}      grade: " + "; ".join([
         str(result.verdict.grade).replace("_", " "), *enlargement_texts(result.verdict)])
             for name, result in zip("AB", results, strict=False)]
 
 
 def _json(found: MapDifference) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    from selfcal_ros.outputs import plain
-
     return plain({
         "significant": found.significant,
         "rms_um": found.rms_m * UM_PER_M, "max_um": found.max_m * UM_PER_M,
@@ -172,8 +164,6 @@ def _verdict_text(found: MapDifference) -> str:
 
 
 def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
-    from selfcal_ros.outputs import plain
-
     return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
                              "difference": row.difference, "u": row.u, "p": row.p}
                   for row in rows})

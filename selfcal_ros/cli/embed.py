@@ -7,9 +7,15 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from selfcal_ros.bagio.attachments import attach, attached
+from selfcal_ros.bagio.offline import bag_input
 from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.cli.trace import origin, records_of, require_unchanged
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_bytes, read_json
+from selfcal_ros.model.result import SCHEMA, result_from_dict
+from selfcal_ros.outputs import check_outputs, write_bytes
 
-HELP = "keep result, plan and exports in the bag, as MCAP attachments"
 KINDS = {".json": "application/json", ".yaml": "application/yaml", ".xml": "application/xml"}
 """Ending -> media type, where the system's table may lack it."""
 
@@ -27,11 +33,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Add files to the bag, or list or extract those that it has."""
-    from selfcal_ros.bagio.attachments import attach, attached
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_bytes
-    from selfcal_ros.outputs import check_outputs, write_bytes
-
     if args.files and args.extract:
         raise InputError("--extract", "files are named, too", "embed first, then extract")
     if args.files:
@@ -54,9 +55,6 @@ def run(args: argparse.Namespace) -> int:
 
 def with_records(names: Sequence[str]) -> list[str]:
     """Return files and the records beside them; refuse files that are not as exported."""
-    from selfcal_ros.cli.trace import origin, records_of, require_unchanged
-    from selfcal_ros.files import read_bytes
-
     more = [(name, beside) for name, beside in zip(names, records_of(names), strict=True)
             if Path(beside).is_file() and beside not in names]
     for name, beside in more:
@@ -71,12 +69,6 @@ def _kind(name: str) -> str:
 
 def check_results(bag: str, names: list[str]) -> None:
     """Refuse results of another bag; a bag with attachments is not that of its results any more."""
-    from selfcal_ros.bagio.attachments import attached
-    from selfcal_ros.bagio.offline import bag_input
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_json
-    from selfcal_ros.model.result import SCHEMA, result_from_dict
-
     results = {name: data for name in names if name.lower().endswith(".json")
                and isinstance(data := read_json(name), dict) and data.get("schema") == SCHEMA}
     if not results or attached(bag):

@@ -2,21 +2,21 @@
 """``selfcal export``: the map of a result as the table of a controller."""
 
 import argparse
-from typing import TYPE_CHECKING
 
-from selfcal_ros.cli.terminal import add_json, say
-
-if TYPE_CHECKING:
-    from selfcal_ros.controllers.grid import Wiring
-
-HELP = "write the map of a result as the table of a controller"
-FORMATS = ("kmotion", "pmac", "beckhoff", "linuxcnc", "siemens")
+from selfcal_ros.aerotech.write import refuse_existing, write_cal
+from selfcal_ros.cli.cal import figures_of, ready, residual_text
+from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
+from selfcal_ros.cli.terminal import add_json, exit_code, say
+from selfcal_ros.cli.trace import command, record, records_of
+from selfcal_ros.controllers.export import FORMATS, export, loaded
+from selfcal_ros.controllers.grid import Source, Wiring
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_text
+from selfcal_ros.outputs import check_outputs
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    from selfcal_ros.cli.cal_lines import add_frame
-
     add = parser.add_argument
     add("format", choices=FORMATS, metavar="|".join(FORMATS), help="the controller")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
@@ -41,15 +41,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the files; code 5 and the reason if it is not qualified."""
-    from selfcal_ros.aerotech.write import refuse_existing, write_cal
-    from selfcal_ros.cli.cal import figures_of, ready, residual_text
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import command, record, records_of
-    from selfcal_ros.controllers.export import export, loaded
-    from selfcal_ros.controllers.grid import Source
-    from selfcal_ros.files import read_text
-    from selfcal_ros.outputs import check_outputs
-
     wiring = _wiring(args)
     result, filled = ready(args)
     active = None
@@ -73,11 +64,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _wiring(args: argparse.Namespace) -> "Wiring":
-    from selfcal_ros.cli.cal_lines import frame_of, numbers
-    from selfcal_ros.controllers.export import FORMATS
-    from selfcal_ros.controllers.grid import Wiring
-    from selfcal_ros.errors import InputError
-
     given, args.counts_per_unit = args.counts_per_unit, None
     args.unit = args.unit or FORMATS[args.format].unit
     frame = frame_of(args)

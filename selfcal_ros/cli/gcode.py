@@ -2,16 +2,23 @@
 """``selfcal gcode``: a program for a controller without tables, corrected."""
 
 import argparse
+from dataclasses import replace
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, say
-
-HELP = "correct a G-code program: for controllers without tables"
+from selfcal_ros.cli.cal import ready
+from selfcal_ros.cli.cal_lines import add_frame, frame_of
+from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
+from selfcal_ros.cli.trace import command, outputs_of, record
+from selfcal_ros.compensation.export import origin_lines
+from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
+from selfcal_ros.controllers.grid import Wiring, wanted
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_text
+from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.units import M_PER_UM
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    from selfcal_ros.cli.cal_lines import add_frame
-
     add = parser.add_argument
     add("program", metavar="IN", help="G-code")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
@@ -27,20 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read program and result, write the program; code 5 and the reason if not qualified."""
-    from dataclasses import replace
-
-    from selfcal_ros.cli.cal import ready
-    from selfcal_ros.cli.cal_lines import frame_of
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import command, outputs_of, record
-    from selfcal_ros.compensation.export import origin_lines
-    from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
-    from selfcal_ros.controllers.grid import Wiring, wanted
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_text
-    from selfcal_ros.outputs import check_outputs, write_text
-    from selfcal_ros.units import M_PER_UM
-
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
         raise InputError("--tolerance, --decimals", f"{args.tolerance} um, {args.decimals}",
                          "give 0.001 to 10000 um and 1 to 9 decimals")

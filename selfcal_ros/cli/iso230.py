@@ -5,17 +5,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from selfcal_ros.cli.terminal import add_json, busy, say
+from selfcal_ros.apply import StageMap, load
+from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.outputs import plain
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.standards import iso230
+from selfcal_ros.standards.iso230 import AxisFigures, PathFigures
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M
-
-if TYPE_CHECKING:
-    from selfcal_ros.apply import StageMap
-    from selfcal_ros.model.readings import Measurements
-    from selfcal_ros.standards.iso230 import AxisFigures, PathFigures
-
-HELP = "figures of ISO 230: accuracy and repeatability of axes, circularity, diagonals"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,10 +37,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the figures; a result that is not qualified ends with code 5, as in `solve`."""
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.standards import iso230
-
     stage, measurements = _read(args)
     if stage.result.plate.map_grid is not None:
         measurements = None
@@ -63,15 +63,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _read(args: argparse.Namespace) -> tuple[StageMap, Measurements | None]:
     """Return the map, and the readings of a bag."""
-    from selfcal_ros.apply import StageMap, load
-    from selfcal_ros.bagio.offline import collect_bag
-    from selfcal_ros.collection.settings.estimator import solver_options
-    from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.model.readings import Sense
-    from selfcal_ros.reporting.words.findings import worded
-
     if args.source.lower().endswith(".json"):
         if args.result:
             raise InputError("--result", f"{args.source} is a result itself", "omit it")
@@ -96,8 +87,6 @@ def _figures(found: AxisFigures | PathFigures) -> dict[str, Any]:
 
 
 def _json(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) -> dict[str, Any]:
-    from selfcal_ros.outputs import plain
-
     return plain({
         "axes": [{"axis": item.axis, "line": item.line_m, "positions": item.position_m,
                   "up": item.up_m, "down": item.down_m, "s_up": item.s_up_m,

@@ -6,16 +6,19 @@ import contextlib
 import errno
 import json
 import os
+import queue
+import select
 import sys
+import termios
+import threading
+import tty
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from selfcal_ros.cli.processes import Eyes, ended_by_signals, eyes
+from selfcal_ros.cli.screen import KEYS, saved_as, screen, what_now
 from selfcal_ros.cli.terminal import add_json
-
-if TYPE_CHECKING:
-    from selfcal_ros.cli.processes import Eyes
-
-HELP = "show a running cell on one screen, and operate its sequencer by keys"
+from selfcal_ros.errors import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,8 +29,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the screen until q, Ctrl-C or the end of the input."""
-    from selfcal_ros.cli.processes import ended_by_signals, eyes
-
     with ended_by_signals(), eyes(args.namespace) as monitor:
         return watch(monitor, [], lambda: None, as_json=args.json)
 
@@ -68,11 +69,9 @@ def _watched(monitor: "Eyes", log: list[str], step: Callable[[], None],
 @contextlib.contextmanager
 def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
     """Draw on the whole terminal, which is restored at the end."""
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    from selfcal_ros.cli.screen import screen
+    from rich.console import Console  # for a terminal only
+    from rich.live import Live  # for a terminal only
+    from rich.text import Text  # for a terminal only
 
     newest: dict[str, Any] = {}
     console = Console()
@@ -92,8 +91,6 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
 @contextlib.contextmanager
 def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
     """Print a line for each change that a script may wait for."""
-    from selfcal_ros.errors import printable
-
     said: dict[str, str] = {}
     there: set[str] = set()
 
@@ -111,8 +108,6 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
 
 def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tuple[str, str]]:
     """Yield changes that a script may wait for; `there` collects the nodes heard so far."""
-    from selfcal_ros.cli.screen import saved_as, what_now
-
     yield "now", what_now(picture)
     if picture["summary"]:
         yield "map", picture["summary"]["state"]
@@ -146,15 +141,9 @@ def _json_lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
 @contextlib.contextmanager
 def _keys() -> Iterator[Callable[[], list[str]]]:
     """Yield a function that returns the keys or words entered since the last call."""
-    import select
-
-    from selfcal_ros.cli.screen import KEYS
-
     if not sys.stdin.isatty():
         yield _words()
         return
-    import termios
-    import tty
 
     before = termios.tcgetattr(sys.stdin)
     try:
@@ -184,9 +173,6 @@ def _read_keys(descriptor: int) -> str:
 
 def _words() -> Callable[[], list[str]]:
     """Return a function that gives the lines of stdin since the last call, also after its end."""
-    import queue
-    import threading
-
     lines: queue.SimpleQueue = queue.SimpleQueue()
 
     def read() -> None:

@@ -6,25 +6,37 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from selfcal_ros.cli import plan_terms
+from selfcal_ros.cli.recheck import planned
 from selfcal_ros.cli.terminal import busy, late_progress, tell
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.observability.plan_budget import PlanBudget, plan_budget
+from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
+from selfcal_ros.estimation.observability.prediction import Prediction
+from selfcal_ros.estimation.observability.resistance import PlannedTerms, TermCheck, check_terms
+from selfcal_ros.estimation.observability.suggest import (
+    Against,
+    Score,
+    Suggestion,
+    best_plan,
+    rank_next,
+)
+from selfcal_ros.estimation.terms.planned import Assumed
+from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL
+from selfcal_ros.files import write_yaml
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.orders import parse_order
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.view import Plan, plan_to_dict, view_to_dict
+from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.reporting.words.tables import plan_budget_text, search_text, step_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from selfcal_ros.estimation.observability.plan_budget import PlanBudget
-    from selfcal_ros.estimation.observability.prediction import Prediction
-    from selfcal_ros.estimation.observability.resistance import TermCheck
-    from selfcal_ros.estimation.observability.suggest import Against, Score, Suggestion
-    from selfcal_ros.estimation.terms.planned import Assumed
-    from selfcal_ros.model.result import Observability
-    from selfcal_ros.model.terms import ModelTerm, TermName
-    from selfcal_ros.model.view import Plan
-
-HELP = "check a plan of views before it is measured, or suggest views"
 
 SHOWN = 8
 """Default number of suggestions."""
@@ -66,23 +78,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sub-verb and return its exit code."""
-    from selfcal_ros.collection.settings.estimator import read_plan
-
     plan = read_plan(args.plan)
     if plan.artifact_from:
-        from selfcal_ros.cli.recheck import planned
-
         return planned(args, _repeated(plan, args.repeats if args.plan_verb == "check" else None))
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
 
 
 def _check(args: argparse.Namespace, plan: Plan) -> int:
-    from selfcal_ros.errors import ExitCode
-    from selfcal_ros.estimation.observability.plan_budget import plan_budget
-    from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
-    from selfcal_ros.model.error_map import ThetaDatum
-    from selfcal_ros.reporting.words.tables import plan_budget_text
-
     assumed, sizes = plan_terms.assumed_of(args), plan_terms.sizes_of(args)
     model = plan_terms.model_of(args, plan)
     plan = _repeated(plan, args.repeats)
@@ -129,9 +131,6 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
 
 
 def _repeated(plan: Plan, repeats: int | None) -> Plan:
-    from dataclasses import replace
-
-    from selfcal_ros.errors import InputError
 
     if repeats is None:
         return plan
@@ -147,9 +146,6 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
 
     `without`: observability and prediction without terms.
     """
-    from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
-    from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL
-
     terms = PlannedTerms(plan, model, assumed)
     seen = terms.told(without[0])
     joint = terms.predicted(without[1]) if seen.identifiable else None
@@ -158,8 +154,6 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
 
 def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,
                 maps: bool) -> dict[str, Any]:
-    from selfcal_ros.outputs import plain
-
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,
            "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None,
@@ -256,15 +250,6 @@ def _map_text(predicted: Prediction) -> list[str]:
 
 
 def _suggest(args: argparse.Namespace, plan: Plan) -> int:
-    from dataclasses import replace
-
-    from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.estimation.observability.suggest import best_plan, rank_next
-    from selfcal_ros.files import write_yaml
-    from selfcal_ros.model.error_map import ThetaDatum
-    from selfcal_ros.model.view import plan_to_dict
-    from selfcal_ros.outputs import check_outputs
-    from selfcal_ros.reporting.words.tables import search_text
 
     if args.top is not None and args.views is not None:
         raise InputError("--top", "with --views one plan is found, not a list", "omit it")
@@ -304,10 +289,6 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
 def _in_order(plan: Plan, order: str) -> Plan:
     """Return the plan with all grid marks visited in `order`, unchanged if empty."""
-    from dataclasses import replace
-
-    from selfcal_ros.model.orders import parse_order
-
     if not order:
         return plan
     order = str(parse_order(order, "--order"))
@@ -317,9 +298,6 @@ def _in_order(plan: Plan, order: str) -> Plan:
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
-    from selfcal_ros.estimation.observability.suggest import Against
-    from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
-
     found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
     found |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
     named = tuple(found[n] for n in TermName if n in found)
@@ -330,9 +308,6 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
 def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
                  ranked: Sequence[Suggestion]) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
-    from selfcal_ros.model.view import view_to_dict
-    from selfcal_ros.reporting.words.tables import step_text
-
     unit = now[1]
     if args.json:
         print(json.dumps({
@@ -350,8 +325,6 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
 
 def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
                how: str) -> None:
-    from selfcal_ros.model.view import view_to_dict
-
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,

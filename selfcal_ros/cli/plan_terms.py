@@ -6,19 +6,25 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.observability.plan_budget import PlanBudget
+from selfcal_ros.estimation.observability.resistance import TermCheck
+from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, Assumed
+from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
+from selfcal_ros.model.terms import (
+    DEFAULT_TERMS,
+    DRIFT_DEGREE,
+    MAX_DRIFT_DEGREE,
+    ModelTerm,
+    TermName,
+    parse_terms,
+)
+from selfcal_ros.model.view import Plan
+from selfcal_ros.reporting.words.tables import removal_text
 from selfcal_ros.units import M_PER, MRAD_PER_RAD, RAD_PER, UM_PER_M
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from selfcal_ros.estimation.observability.plan_budget import PlanBudget
-    from selfcal_ros.estimation.observability.resistance import TermCheck
-    from selfcal_ros.estimation.terms.planned import Assumed
-    from selfcal_ros.model.terms import ModelTerm, TermName
-    from selfcal_ros.model.view import Plan
 
 SIGMA = "20e-9"
 SIGMA_THETA = "3.6arcsec"
@@ -90,10 +96,6 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
     InputError
         For an invalid length, order or degree.
     """
-    from selfcal_ros.estimation.terms.planned import Assumed
-    from selfcal_ros.model.orders import parse_order
-    from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE
-
     degree = DRIFT_DEGREE if args.drift_degree is None else args.drift_degree
     if not 1 <= degree <= MAX_DRIFT_DEGREE:
         raise InputError("--drift-degree", f"{degree} is not a degree of a drift",
@@ -114,8 +116,6 @@ def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
     InputError
         For an unknown term or one without a size.
     """
-    from selfcal_ros.model.terms import parse_terms
-
     terms = parse_terms(_named(args.against), "--against")
     for term in terms:
         if term.free:
@@ -126,8 +126,6 @@ def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
 
 def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the model: the plan's, replaced by those of ``--model``."""
-    from selfcal_ros.model.terms import TermName, parse_terms
-
     if _is_none(args.model):
         return ()
     found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
@@ -157,8 +155,6 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    from selfcal_ros.model.terms import DEFAULT_TERMS, TermName
-
     names = {term.name for term in named} | ({TermName.MICROSCOPE} if tells_camera(plan) else set())
     return () if _is_none(given) else tuple(
         term for term in DEFAULT_TERMS if term.name not in names)
@@ -172,8 +168,6 @@ def tells_camera(plan: Plan) -> bool:
 
 def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, Any]:
     """Return the predicted budget of a plan for programs."""
-    from selfcal_ros.reporting.words.tables import removal_text
-
     lines = []
     for line in budget.lines:
         removed = budget.removals.get((line.quantity, line.component))
@@ -217,8 +211,6 @@ def _modes(number: int) -> str:
 
 def size_text(check: TermCheck) -> str:
     """Return the size of a term in a person's unit."""
-    from selfcal_ros.model.terms import TermName
-
     if check.unit == "m":
         return f"{check.size * UM_PER_M:.6g} µm"
     if check.name is TermName.PLATE_SCALE:
@@ -227,9 +219,6 @@ def size_text(check: TermCheck) -> str:
 
 
 def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
-    from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M
-    from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
-
     views = [view for view in plan.views if view.grid]
     orders = {view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER)
               for view in views}

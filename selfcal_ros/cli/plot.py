@@ -2,10 +2,15 @@
 """``selfcal plot``: the maps of a result as one picture."""
 
 import argparse
+from pathlib import Path
 
+from selfcal_ros.cli.report import read_truth
 from selfcal_ros.cli.terminal import add_json, busy, say
-
-HELP = "draw the maps of a result: png, svg or pdf"
+from selfcal_ros.errors import ExitCode
+from selfcal_ros.outputs import check_outputs
+from selfcal_ros.reporting.figures.maps import map_picture
+from selfcal_ros.reporting.figures.paper import save_picture
+from selfcal_ros.results import read_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,15 +25,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, draw the picture, print its path."""
-    from pathlib import Path
-
-    from selfcal_ros.cli.report import read_truth
-    from selfcal_ros.errors import ExitCode
-    from selfcal_ros.outputs import check_outputs
-    from selfcal_ros.reporting.figures.maps import map_picture
-    from selfcal_ros.reporting.figures.paper import save_picture
-    from selfcal_ros.results import read_result
-
     check_outputs([args.result, args.truth], [args.output])
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None

@@ -3,15 +3,16 @@
 
 import argparse
 import json
-from typing import TYPE_CHECKING
 
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, tell
-
-if TYPE_CHECKING:
-    from selfcal_ros.model.view import Plan
-
-HELP = "whether a stage is as its calibration found it, from one view of the same plate"
+from selfcal_ros.collection.settings.estimator import calibration_of
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.planned import predict_recheck
+from selfcal_ros.model.view import Plan
+from selfcal_ros.outputs import plain
+from selfcal_ros.reporting.summary.numbers import counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -28,13 +29,6 @@ def run(args: argparse.Namespace) -> int:
 
 def planned(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what views of a known plate will tell; for `selfcal plan check`."""
-    from selfcal_ros.collection.settings.estimator import calibration_of
-    from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.estimation.recheck.change import known_plate
-    from selfcal_ros.estimation.recheck.planned import predict_recheck
-    from selfcal_ros.outputs import plain
-    from selfcal_ros.reporting.summary.numbers import counted
-
     if args.plan_verb == "suggest":
         raise InputError(args.plan, "its plate is known: any view that reads all marks will do",
                          "check the plan")

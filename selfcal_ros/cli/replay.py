@@ -9,10 +9,25 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from selfcal_ros.bagio.offline import bag_input, clock_lines
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
-from selfcal_ros.cli.terminal import add_json, aside, file_of, on_stdout, put
+from selfcal_ros.cli.solve import node_settings
+from selfcal_ros.cli.terminal import (
+    add_json,
+    aside,
+    exit_code,
+    file_of,
+    on_stdout,
+    progress_bar,
+    put,
+    show,
+)
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_json
+from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
-HELP = "play a bag into the live nodes and take the map from them"
 AS_RECORDED = -1
 LARGEST_SEED = 2**31
 NODES = ("measurement_collector", "pose_sequencer", "solver")
@@ -37,13 +52,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the nodes, play the bag, collect the result, stop the nodes."""
-    from selfcal_ros.bagio.offline import bag_input
-    from selfcal_ros.cli.terminal import exit_code, show
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_json
-    from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
-    from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
-
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
@@ -78,10 +86,6 @@ def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
 
     Also return the counts of messages stamped in the future, which were not played, by reason.
     """
-    from selfcal_ros.bagio.offline import clock_lines
-    from selfcal_ros.cli.solve import node_settings
-    from selfcal_ros.collection.settings.nodes import CollectorSettings
-
     settings = node_settings(args.params, CollectorSettings)
     lines, refused = clock_lines(args.bag, settings, args.namespace)
     for line in lines:
@@ -90,8 +94,6 @@ def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:
-    from selfcal_ros.cli.terminal import progress_bar
-
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate

@@ -6,9 +6,19 @@ import os
 import sys
 from pathlib import Path
 
+from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.cli.terminal import add_json, busy, say
-
-HELP = "write a calibration report: one self-contained HTML or PDF file"
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_json, read_yaml
+from selfcal_ros.outputs import check_outputs
+from selfcal_ros.reporting.chapters import ABOUT
+from selfcal_ros.reporting.figures.maps import map_picture
+from selfcal_ros.reporting.report import check_name, write_report
+from selfcal_ros.reporting.summary.numbers import can_print_symbols
+from selfcal_ros.reporting.summary.sections import summary_text
+from selfcal_ros.results import read_result
+from selfcal_ros.standards.chapter import certificate_chapter
+from selfcal_ros.standards.details import details_from_dict
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,14 +42,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
-    from selfcal_ros.aerotech.verify import table_chapter
-    from selfcal_ros.outputs import check_outputs
-    from selfcal_ros.reporting.chapters import ABOUT
-    from selfcal_ros.reporting.report import check_name, write_report
-    from selfcal_ros.reporting.summary.numbers import can_print_symbols
-    from selfcal_ros.reporting.summary.sections import summary_text
-    from selfcal_ros.results import read_result
-
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
     check_outputs([args.result, args.truth, args.details], [output, args.plot])
     check_name(output)
@@ -47,15 +49,11 @@ def run(args: argparse.Namespace) -> int:
     truth = read_truth(args.truth) if args.truth else None
     more = [table_chapter(result)]
     if args.details:
-        from selfcal_ros.files import read_yaml
-        from selfcal_ros.standards.chapter import certificate_chapter
-        from selfcal_ros.standards.details import details_from_dict
         more.append(certificate_chapter(result, details_from_dict(read_yaml(args.details),
                                                                   args.details)))
     with busy("drawing"):
         if args.plot:
-            from selfcal_ros.reporting.figures.maps import map_picture
-            from selfcal_ros.reporting.figures.paper import save_picture
+            from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
             save_picture(map_picture(result, truth), args.plot)
         write_report(result, output, truth=truth, more=more,
                      about={name: getattr(args, name) for name in ABOUT})
@@ -69,9 +67,6 @@ def run(args: argparse.Namespace) -> int:
 
 def read_truth(path: str) -> dict:
     """Return the truth in a TRUTH.json; InputError if it is invalid."""
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_json
-
     truth = read_json(path)
     if not isinstance(truth, dict):
         raise InputError(path, "not a mapping", "give gx, gy (m) and g_theta (rad)")

@@ -4,15 +4,15 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from selfcal_ros.cli.terminal import add_json, late_progress, say
-
-if TYPE_CHECKING:
-    from selfcal_ros.parallel import Progress
-    from selfcal_ros.reporting.figures.drawing import Drawing
-
-HELP = "run the published simulations of Hu or Qiao next to the published figures"
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.outputs import write_text
+from selfcal_ros.papers.figures import hu_figures, qiao_figures
+from selfcal_ros.papers.hu import hu_text, reproduce_hu
+from selfcal_ros.papers.qiao import SIZES, qiao_text, reproduce_qiao
+from selfcal_ros.parallel import Progress, check_workers
+from selfcal_ros.reporting.figures.drawing import Drawing
 
 MANY = 1000
 """Number of draws from which several processes are faster."""
@@ -34,10 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the simulation, print and save the requested output."""
-    from selfcal_ros.errors import ExitCode, InputError
-    from selfcal_ros.outputs import write_text
-    from selfcal_ros.parallel import check_workers
-
     if args.draws < 1:
         raise InputError("--draws", f"{args.draws} is not positive", "give 1 or more")
     if args.seed < 0:
@@ -50,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         text, figures, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
     say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})
     if folder is not None:
-        from selfcal_ros.reporting.figures.paper import save_picture
+        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
         write_text(folder / f"{args.paper}.txt", text + "\n")
         for drawing in figures():
@@ -61,8 +57,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make(folder: Path) -> None:
-    from selfcal_ros.errors import InputError
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -71,13 +65,9 @@ def _make(folder: Path) -> None:
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    from selfcal_ros.papers.hu import hu_text, reproduce_hu
-
     found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
-    def figures() -> "list[Drawing]":
-        from selfcal_ros.papers.figures import hu_figures
-
+    def figures() -> list[Drawing]:
         return hu_figures(found)
 
     tables = [{"name": run.published.name, "sigma_um": run.published.sigma_um,
@@ -89,13 +79,9 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
 
 
 def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    from selfcal_ros.papers.qiao import SIZES, qiao_text, reproduce_qiao
-
     found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 
-    def figures() -> "list[Drawing]":
-        from selfcal_ros.papers.figures import qiao_figures
-
+    def figures() -> list[Drawing]:
         return qiao_figures(found)
 
     programs = [{"views": program.views, "rms_um": program.rms_um,

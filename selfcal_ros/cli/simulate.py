@@ -3,9 +3,9 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import add_json, say
-
-HELP = "write a bag of a simulated cell, with its known truth"
+from selfcal_ros.cli.terminal import add_json, progress_bar, say
+from selfcal_ros.simulation.bag import write_files, write_simulation
+from selfcal_ros.simulation.spec import read_simulation
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,10 +20,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and print what was written."""
-    from selfcal_ros.cli.terminal import progress_bar
-    from selfcal_ros.simulation.bag import write_files, write_simulation
-    from selfcal_ros.simulation.spec import read_simulation
-
     simulation = read_simulation(args.sim)
     write = write_files if args.png else write_simulation
     with progress_bar("simulating") as bar:

@@ -3,15 +3,49 @@
 
 import argparse
 import sys
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
-from selfcal_ros.cli.terminal import add_json, aside, file_of, on_stdout, put
-from selfcal_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from selfcal_ros.collection.settings.nodes import CollectorSettings, Settings, SolverSettings
-
-HELP = "calibrate from a bag: MCAP file or rosbag2 folder"
+from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
+from selfcal_ros.cli.terminal import (
+    add_json,
+    aside,
+    busy,
+    exit_code,
+    file_of,
+    on_stdout,
+    progress_bar,
+    put,
+    show,
+)
+from selfcal_ros.collection.inputs import advice
+from selfcal_ros.collection.reduce import with_places
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import (
+    CollectorSettings,
+    Settings,
+    SolverSettings,
+    overrides_in,
+)
+from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.checks.placing import PlacingError
+from selfcal_ros.estimation.checks.wiring import WiringError
+from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.validation import judged_by, validate
+from selfcal_ros.estimation.verdict.uncertainty import budgets
+from selfcal_ros.files import read_yaml
+from selfcal_ros.model.artifact import with_nodes
+from selfcal_ros.model.result import (
+    created_now,
+    result_to_dict,
+    unidentified_result,
+    with_input,
+)
+from selfcal_ros.outputs import check_outputs, write_json
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.phrases import excluded_text, recheck_lines
+from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -83,9 +117,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
     """Return the settings of a node from a parameter file, if any, and arguments, which win."""
-    from selfcal_ros.collection.settings.nodes import overrides_in
-    from selfcal_ros.files import read_yaml
-
     where = params or "options"
     overrides = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
     overrides |= {name: value for name, value in given.items() if value is not None}
@@ -94,8 +125,6 @@ def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) 
 
 def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
     """Return the settings of collector and solver; options take precedence over the file."""
-    from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
-
     collector = node_settings(args.params, CollectorSettings, measurement_sense=args.sense)
     solver = node_settings(
         args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
@@ -144,20 +173,6 @@ def _reference(text: str | None) -> dict[str, Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Collect, calibrate, print the summary and write the result."""
-    from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
-    from selfcal_ros.cli.terminal import busy, exit_code, progress_bar, show
-    from selfcal_ros.collection.inputs import advice
-    from selfcal_ros.collection.settings.estimator import solver_options
-    from selfcal_ros.errors import NotIdentifiableError
-    from selfcal_ros.model.result import (
-        created_now,
-        result_to_dict,
-        unidentified_result,
-        with_input,
-    )
-    from selfcal_ros.outputs import check_outputs
-    from selfcal_ros.reporting.words.findings import worded
-
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:
         from selfcal_ros.reporting.report import check_name  # loads every figure
@@ -195,8 +210,8 @@ def run(args: argparse.Namespace) -> int:
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
-        from selfcal_ros.aerotech.verify import table_chapter
-        from selfcal_ros.reporting.report import write_report
+        from selfcal_ros.aerotech.verify import table_chapter  # draws, as a report alone does
+        from selfcal_ros.reporting.report import write_report  # loads every figure
         write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
@@ -208,10 +223,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
     """Return the readings with the nodes of --map, if it is given."""
-    from dataclasses import replace
-
-    from selfcal_ros.model.artifact import with_nodes
-
     if not args.map:
         return measurements
     return replace(measurements, artifact=with_nodes(measurements.artifact, args.map, "--map"))
@@ -219,13 +230,8 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
 
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
     """Return the result without sentences; errors of offsets or plate name the bag."""
-    from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.estimation.checks.placing import PlacingError
-    from selfcal_ros.estimation.checks.wiring import WiringError
-
     try:
         if args.robust:
-            from selfcal_ros.estimation.quality.outliers import robust_calibrate
             return robust_calibrate(measurements, options)
         return calibrate(measurements, options)
     except (WiringError, PlacingError) as error:
@@ -234,8 +240,6 @@ def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> An
 
 def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
     """Write a result to a file, to stdout, or both."""
-    from selfcal_ros.outputs import write_json
-
     if file_of(args):
         write_json(args.output, data)
     if on_stdout(args):
@@ -245,17 +249,9 @@ def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
 def _validated(args: argparse.Namespace, measurements: Any, options: Any,
                result: Any) -> tuple[Any, list[str]]:
     """Return the result with places, validated if requested, and the text to print."""
-    from dataclasses import replace
-
-    from selfcal_ros.collection.reduce import with_places
-
     lines: list[str] = []
     result = with_places(result, measurements.views)
     if args.validate:
-        from selfcal_ros.estimation.quality.outliers import clean
-        from selfcal_ros.estimation.quality.validation import judged_by, validate
-        from selfcal_ros.reporting.words.tables import validation_json, validation_text
-
         used = clean(measurements, options).measurements if args.robust else measurements
         found = validate(used, replace(options, prior=""))
         result = judged_by(result, found)
@@ -268,8 +264,6 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 
 def _since(result: Any) -> list[str]:
     """Return the change since the calibration of a known plate as it is printed."""
-    from selfcal_ros.reporting.words.phrases import recheck_lines
-
     found = result.extra.get("recheck")
     return [] if found is None else ["", f"change since {found['of']}:", *(
         f"  {line}" for line in recheck_lines(found))]
@@ -277,10 +271,6 @@ def _since(result: Any) -> list[str]:
 
 def _budget(result: Any) -> list[str]:
     """Return the budget as it is printed."""
-    from selfcal_ros.estimation.verdict.uncertainty import budgets
-    from selfcal_ros.reporting.words.phrases import excluded_text
-    from selfcal_ros.reporting.words.tables import budget_text
-
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
     return ["", *budget_text(budgets(result)),

@@ -5,19 +5,28 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from selfcal_ros import __version__
+from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
+from selfcal_ros.aerotech.model import Table1D
+from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
+from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.files import read_yaml, sha256_of
+from selfcal_ros.laser.bag import SeriesTopics, read_series
+from selfcal_ros.laser.data import DIAGONALS, Form, Method, StepDiagonal, StepDiagonalResult
+from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
+from selfcal_ros.laser.profiles import ReferenceLine, axis_corrections
+from selfcal_ros.laser.report import outcome, profiles_figure, summary, truth_of
+from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
+from selfcal_ros.laser.table import Columns, dimension_of, read_table, table_text, write_table
+from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
+from selfcal_ros.outputs import check_outputs, write_json, write_text
 from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
 
-if TYPE_CHECKING:
-    from selfcal_ros.aerotech.model import Table1D
-    from selfcal_ros.compensation.frame import MachineFrame
-    from selfcal_ros.laser.data import StepDiagonal, StepDiagonalResult
-
-HELP = "identify linear, straightness and squareness errors from a laser step-diagonal measurement"
 STEP_MM = 10.0
 SHORTEST_MM = 1e-6
 """Shorter steps, below 1 nm, are refused."""
@@ -69,12 +78,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify the errors, write the result, and print a summary."""
-    from selfcal_ros.laser.data import Form, Method
-    from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
-    from selfcal_ros.laser.profiles import ReferenceLine
-    from selfcal_ros.laser.report import outcome, summary
-    from selfcal_ros.outputs import write_json
-
     _check_outputs(args)
     if args.simulate:
         return _simulate(args)
@@ -92,8 +95,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in result["warnings"]:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
     if args.plot:
-        from selfcal_ros.laser.report import profiles_figure
-        from selfcal_ros.reporting.figures.paper import save_picture
+        from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
         save_picture(profiles_figure(found, data), args.plot)
     if args.cal:
         _write_cal(args, found)
@@ -108,9 +110,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written."""
-    from selfcal_ros.aerotech.write import refuse_existing
-    from selfcal_ros.outputs import check_outputs
-
     measured = not args.simulate
     for option, path, there, remedy in (
             ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
@@ -137,10 +136,6 @@ def _refuse_machine(args: argparse.Namespace) -> None:
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     """Write the corrections as 1D tables."""
-    from selfcal_ros import __version__
-    from selfcal_ros.aerotech.export import DECIMALS
-    from selfcal_ros.aerotech.write import cal_text, write_cal
-
     frame = frame_of(args)
     comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
                 f"{found.method} formulation; correction = -(actual - commanded)",
@@ -157,9 +152,6 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
 
     The machine's home is counted from the start of the first block.
     """
-    from selfcal_ros.aerotech.export import AxisCorrection, line_table
-    from selfcal_ros.laser.profiles import axis_corrections
-
     lines = axis_corrections(found)
     return [line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
             for pair in sorted(lines)]
@@ -167,12 +159,6 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
 
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
-    from selfcal_ros.files import read_yaml
-    from selfcal_ros.laser.report import truth_of
-    from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
-    from selfcal_ros.laser.table import table_text
-    from selfcal_ros.outputs import write_json, write_text
-
     if args.data is not None:
         raise InputError("arguments", "--simulate makes data and reads none",
                          "omit DATA.csv")
@@ -194,9 +180,6 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _measurement(args: argparse.Namespace) -> tuple:
     """Return the measurement, its warnings, and its source."""
-    from selfcal_ros.files import sha256_of
-    from selfcal_ros.laser.table import Columns, dimension_of, read_table
-
     if is_bag(args.data):
         data, warnings = measurement_from_bag(args, _steps(args, len(joints_of(args))))
         if args.diagonals is not None:
@@ -221,8 +204,6 @@ def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
 
 
 def _diagonals(args: argparse.Namespace, dim: int) -> tuple[str, ...]:
-    from selfcal_ros.laser.data import DIAGONALS
-
     if args.diagonals is None:
         return DIAGONALS[dim]
     names = tuple(name.strip() for name in args.diagonals.split(","))
@@ -299,10 +280,6 @@ def measurement_from_bag(args: argparse.Namespace,
     InputError
         If a topic is missing, an option is not a valid number, or the bag cannot be used.
     """
-    from selfcal_ros.laser.bag import SeriesTopics, read_series
-    from selfcal_ros.laser.table import write_table
-    from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
-
     for option, value in (("--laser-topic", args.laser_topic),
                           ("--position-topic", args.position_topic)):
         if not value:

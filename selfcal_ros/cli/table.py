@@ -2,14 +2,19 @@
 """``selfcal table``: the maps of a result as a CSV table or as numpy arrays."""
 
 import argparse
-from typing import TYPE_CHECKING
+import io
+import math
+from pathlib import Path
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, say
+import numpy as np
 
-if TYPE_CHECKING:
-    from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
+from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.results import read_result
 
-HELP = "write the maps of a result as a table: csv or npz"
 COLUMNS = ("m", "n", "x_m", "y_m", "gx_m", "gy_m", "u_gx_m", "u_gy_m",
            "k", "angle_rad", "g_theta_rad", "u_g_theta_rad")
 KINDS = (".csv", ".npz")
@@ -30,14 +35,6 @@ def run(args: argparse.Namespace) -> int:
 
     A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
     """
-    from pathlib import Path
-
-    from selfcal_ros.cli.terminal import exit_code
-    from selfcal_ros.cli.trace import outputs_of, record
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.outputs import check_outputs, write_bytes
-    from selfcal_ros.results import read_result
-
     kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()
     if kind not in KINDS:
         raise InputError(args.output, "its ending is not that of a table",
@@ -56,8 +53,6 @@ def run(args: argparse.Namespace) -> int:
 
 def csv_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
-    import math
-
     emap, plate = result.error_map, result.artifact
     rows = [",".join(COLUMNS)]
     pitch = plate.grid_pitch_m
@@ -78,10 +73,6 @@ def _cell(value: float) -> str:
 
 def npz_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as arrays by the names of RESULT.json, [i, j] = site m = i - h, n = j - h."""
-    import io
-
-    import numpy as np
-
     emap, plate = result.error_map, result.artifact
     out, found = io.BytesIO(), result.plate.marks
     marks = {} if found is None else {

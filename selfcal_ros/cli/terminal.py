@@ -6,13 +6,14 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO
 
-from selfcal_ros.errors import ExitCode, did_you_mean, printable
-
-if TYPE_CHECKING:
-    from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.errors import ExitCode
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verdict import Grade
+from selfcal_ros.outputs import json_text
+from selfcal_ros.reporting.summary.numbers import can_print_symbols, printable, to_ascii
 
 STDOUT = "-"
 """Name of an output file: the result goes to stdout, everything else to stderr."""
@@ -33,15 +34,11 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
 
 def tell(text: str) -> None:
     """Print text; if stdout cannot encode µ, ° and the like, they are spelled out."""
-    from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
-
     print(text if can_print_symbols(sys.stdout) else to_ascii(text))
 
 
 def put(data: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
-    from selfcal_ros.outputs import json_text
-
     print(json_text(data))
 
 
@@ -60,68 +57,10 @@ def aside(args: argparse.Namespace) -> TextIO:
     return sys.stderr if on_stdout(args) else sys.stdout
 
 
-class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are one line on stderr, exit code 2.
-
-    An unknown verb, choice or option is answered with similar ones.
-    Sub-parsers are of this class, too. ``leaf`` of the arguments is the innermost parser.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.set_defaults(leaf=self)
-
-    def parse_args(self, args: Sequence[str] | None = None,  # type: ignore[override]
-                   namespace: argparse.Namespace | None = None) -> argparse.Namespace:
-        """Return the arguments; an unknown option ends with a line that names it."""
-        found, unknown = self.parse_known_args(args, namespace)
-        if unknown:
-            found.leaf.refuse(unknown)
-        return found
-
-    def refuse(self, unknown: Sequence[str]) -> NoReturn:
-        """End with a line on the first argument that is not recognised."""
-        word = next((word for word in unknown if word.startswith("-")), unknown[0])
-        name = word.partition("=")[0]
-        if not word.startswith("-"):
-            self.error(f"'{word}' is one argument too many")
-        hint = did_you_mean(name, self._option_string_actions)
-        self.error(f"the option {name} is unknown{hint and '; ' + hint}")
-
-    def error(self, message: str) -> NoReturn:
-        """End with one line and exit code 2."""
-        required = "the following arguments are required: "
-        if message.startswith(required):
-            names = message.removeprefix(required).replace("/--", " or --")
-            verbs = [verb for action in self._actions if str(action.metavar) == names
-                     and isinstance(action.choices, dict) for verb in action.choices
-                     if verb not in names]
-            message = f"{names} {'are' if ', ' in names else 'is'} missing" + (
-                f": one of {', '.join(verbs)}" if verbs else "")
-        self.exit(int(ExitCode.BAD_INPUT),
-                  printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
-
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a value that is not among the choices, with similar ones."""
-        if action.choices is None or value in action.choices:
-            return
-        choices: Iterable[str] = map(str, action.choices)
-        known = list(choices)
-        hint = did_you_mean(str(value), known) or f"known are {', '.join(known)}"
-        raise argparse.ArgumentError(None, f"{_name_of(action)} '{value}' is unknown; {hint}")
-
-
-def _name_of(action: argparse.Action) -> str:
-    if action.option_strings:
-        return f"{action.option_strings[-1]}:"
-    return str(action.metavar or action.dest)
-
-
-def show(result: "CalibrationResult", bag: str, output: str | None, stream: TextIO) -> None:
+def show(result: CalibrationResult, bag: str, output: str | None, stream: TextIO) -> None:
     """Print the summary, compared with the truth if the bag folder has one."""
-    from selfcal_ros.bagio.offline import read_truth
-    from selfcal_ros.reporting.summary.numbers import can_print_symbols
-    from selfcal_ros.reporting.summary.sections import summary_text
+    from selfcal_ros.bagio.offline import read_truth  # with mcap, which not every verb needs
+    from selfcal_ros.reporting.summary.sections import summary_text  # with scipy, likewise
 
     print(summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
           file=stream)
@@ -129,22 +68,17 @@ def show(result: "CalibrationResult", bag: str, output: str | None, stream: Text
         print(f"result: {output}", file=stream)
 
 
-def exit_code(result: "CalibrationResult") -> int:
+def exit_code(result: CalibrationResult) -> int:
     """Return the exit code of a result that was computed: 0, or 5 if it is not qualified.
 
     The reason is printed in one line on stderr in any case.
     """
-    from selfcal_ros.errors import ExitCode
-
     said = say_unless_qualified(result, "selfcal")
     return int(ExitCode.NOT_QUALIFIED if said else ExitCode.DONE)
 
 
-def say_unless_qualified(result: "CalibrationResult", who: str) -> bool:
+def say_unless_qualified(result: CalibrationResult, who: str) -> bool:
     """Print the verdict on stderr, and return whether a result is not qualified."""
-    from selfcal_ros.model.verdict import Grade
-    from selfcal_ros.reporting.summary.numbers import can_print_symbols, printable, to_ascii
-
     if result.verdict.grade is Grade.GOOD:
         return False
     line = printable(f"{who}: {result.verdict.sentence}")
@@ -158,8 +92,8 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
     if not sys.stderr.isatty():
         yield _nothing
         return
-    from rich.console import Console
-    from rich.progress import Progress
+    from rich.console import Console  # for a terminal only
+    from rich.progress import Progress  # for a terminal only  # for a terminal only
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
@@ -180,7 +114,6 @@ def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, i
     began = time.monotonic()
     draw: Callable[[int, int | None], None] | None = None
     with contextlib.ExitStack() as stack:
-
         def advance(done: int, total: int | None = None) -> None:
             nonlocal draw
             if draw is None and time.monotonic() - began >= after_s:
@@ -215,8 +148,13 @@ def _watch(label: str, after_s: float, ended: threading.Event) -> None:
     """Draw from `after_s` on until `ended` is set."""
     if ended.wait(after_s):
         return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.console import Console  # for a terminal only
+    from rich.progress import (  # for a terminal only  # for a terminal only
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
 
     with Progress(SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
                   console=Console(stderr=True), transient=True) as bar:

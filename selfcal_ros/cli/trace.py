@@ -11,14 +11,16 @@ import shlex
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from selfcal_ros import __version__
 from selfcal_ros.cli.terminal import STDOUT, add_json, say
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import parse_json, read_bytes, sha256_of
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import write_json
+from selfcal_ros.results import attachments, bag_files, result_bytes
 
-if TYPE_CHECKING:
-    from selfcal_ros.model.result import CalibrationResult
-
-HELP = "from which result a table was exported, and whether both are unchanged"
 SCHEMA = "selfcal.origin/1"
 ENDING = ".origin.json"
 REMEDY = "export it again"
@@ -46,10 +48,6 @@ def outputs_of(args: argparse.Namespace) -> list[str]:
 def record(args: argparse.Namespace, result: "CalibrationResult",
            paths: Iterable[str | os.PathLike]) -> None:
     """Write the record of each exported file; none of a pipe or a device."""
-    from selfcal_ros import __version__
-    from selfcal_ros.files import sha256_of
-    from selfcal_ros.outputs import write_json
-
     source, digest = result.read_from or ("", "")
     for path in map(Path, paths):
         if path.is_file():
@@ -68,9 +66,6 @@ def command(args: argparse.Namespace) -> str:
 
 def origin(raw: bytes, where: str) -> dict[str, Any]:
     """Return the fields of a record; InputError if it is none."""
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import parse_json
-
     data = parse_json(raw, where)
     texts = [data.get(key) for key in ("file", "sha256", "created", "command")] if isinstance(
         data, dict) and data.get("schema") == SCHEMA else [None]
@@ -83,8 +78,6 @@ def origin(raw: bytes, where: str) -> dict[str, Any]:
 
 def require_unchanged(name: str, raw: bytes, made: dict[str, Any]) -> None:
     """Refuse a file that is not as it was exported."""
-    from selfcal_ros.errors import InputError
-
     if hashlib.sha256(raw).hexdigest() != made["sha256"]:
         raise InputError(name, f"was changed after its export on {made['created']}", REMEDY)
 
@@ -111,10 +104,6 @@ def traced(name: str, result: str | None) -> Sequence[tuple[str, dict[str, Any],
     InputError
         If there is no record, or the file or its result is not the one of the record.
     """
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_bytes
-    from selfcal_ros.results import attachments, bag_files, result_bytes
-
     files = bag_files(Path(name))
     if not files:
         if not Path(name).exists():
@@ -143,8 +132,6 @@ def traced(name: str, result: str | None) -> Sequence[tuple[str, dict[str, Any],
 
 def _require_result(name: str, made: dict[str, Any], candidates: dict[str, bytes]) -> str:
     """Return which of several files is the result of a record."""
-    from selfcal_ros.errors import InputError
-
     for source, raw in candidates.items():
         if hashlib.sha256(raw).hexdigest() == made["result"]["sha256"]:
             return source

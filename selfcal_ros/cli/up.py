@@ -6,9 +6,12 @@ import contextlib
 import os
 from pathlib import Path
 
+from selfcal_ros.cli.monitor import watch
+from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
 from selfcal_ros.cli.terminal import add_json
-
-HELP = "start and supervise the nodes of a cell, and run a calibration on one screen"
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_bytes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,12 +37,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start and supervise the nodes, show the screen, stop the nodes at the end."""
-    from selfcal_ros.cli.monitor import watch
-    from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
-    from selfcal_ros.collection.settings.estimator import read_plan
-    from selfcal_ros.errors import InputError
-    from selfcal_ros.files import read_bytes
-
     need_ros("")
     read_plan(args.plan)
     if args.params:

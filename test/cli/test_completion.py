@@ -9,7 +9,8 @@ import pytest
 
 
 @pytest.mark.parametrize(("line", "wanted"), [
-    ("selfcal so", {"solve"}), ("selfcal plan ", {"check", "suggest"}),
+    ("selfcal so", {"solve"}), ("selfcal cal", {"cal", "call"}),
+    ("selfcal plan ", {"check", "suggest"}),
     ("selfcal solve --meth", {"--method"}), ("selfcal solve --method ", {"joint", "law"}),
     ("selfcal cal ev", {"eval"})])
 def test_words_are_completed(tmp_path, line, wanted):
@@ -24,3 +25,11 @@ def test_words_are_completed(tmp_path, line, wanted):
     assert done.returncode == 0 and done.stdout == b""
     words = {word.strip() for word in found.read_text().splitlines()}
     assert words - {"-h", "--help"} == wanted
+
+
+def test_help_loads_no_verb_and_no_numpy():
+    code = ("import atexit, sys; from selfcal_ros.cli.main import main; "
+            "atexit.register(lambda: print({'numpy', 'selfcal_ros.cli.solve'} & {*sys.modules}, "
+            "file=sys.stderr)); main(['--help'])")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr == "set()\n" and "solve" in done.stdout

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from selfcal_ros.cli import export
 from selfcal_ros.cli.main import main
-from selfcal_ros.controllers.export import FORMATS
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -29,10 +27,6 @@ def desk(tmp_path, monkeypatch):
 
 def run(line: str) -> int:
     return main(["export", *line.split()])
-
-
-def test_the_verb_knows_the_formats_without_loading_them():
-    assert tuple(FORMATS) == export.FORMATS
 
 
 @pytest.mark.parametrize(("name", "files"), [

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros import __version__
-from selfcal_ros.cli.main import verbs
+from selfcal_ros.cli.main import VERBS
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.view import plan_from_dict
@@ -65,7 +65,7 @@ def test_versions_agree():
 
 def test_readme_names_every_verb_and_every_page_of_the_documentation():
     readme = (ROOT / "README.md").read_text()
-    for verb in verbs():
+    for verb in VERBS:
         assert f"selfcal {verb}" in readme
     for page in (ROOT / "docs").glob("*.md"):
         assert f"docs/{page.name}" in readme

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from selfcal_ros.cli.main import main, verbs
+from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
@@ -33,7 +33,7 @@ def test_the_simulation_of_the_documentation_runs(tmp_path, capsys):
     assert printed.err.splitlines()[-1].startswith("selfcal: Good within an enlarged U: ")
 
 
-@pytest.mark.parametrize("verb", verbs())
+@pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_itself(verb, capsys):
     with pytest.raises(SystemExit) as ended:
         main([verb, "--help"])
