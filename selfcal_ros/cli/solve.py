@@ -86,7 +86,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
                         "scale: artifact, stage_x or stage_y, its relative error and the standard "
                         "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
-                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U")
+                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
+                        "marks marks:ID:ID:LENGTH:U")
     parser.add_argument("--certificate", metavar="TEXT",
                         help="certificate of the reference: number and issuer")
     parser.add_argument("--reference-at", metavar="T:U_T:ALPHA:U_ALPHA[:T0]",

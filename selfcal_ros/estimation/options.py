@@ -81,7 +81,8 @@ class ReferenceLength:
         Parameters
         ----------
         text : str
-            M,N:M,N:LENGTH:U: the marks, their distance and its standard uncertainty, m.
+            M,N:M,N:LENGTH:U: the marks, their distance and its standard uncertainty, m; of a list
+            of marks ID:ID:LENGTH:U.
         artifact : Artifact
             The plate.
         certificate : str
@@ -92,16 +93,19 @@ class ReferenceLength:
         InputError
             If the text is something else, or the marks are not two of the plate.
         """
-        where, example = "reference length", "write e.g. -5,0:5,0:0.1000002:5e-9 (m)"
+        where, form = "reference length", "ID:ID" if artifact.marks else "M,N:M,N"
+        example = f"write e.g. {'17:42' if artifact.marks else '-5,0:5,0'}:0.1000002:5e-9 (m)"
         try:
             first, second, *numbers = text.split(":")
-            marks = tuple((int(m), int(n)) for m, n in (first.split(","), second.split(",")))
+            more = ",0" * (artifact.marks is not None)
+            marks = tuple((int(m), int(n)) for m, n in (
+                (name + more * ("," not in name)).split(",") for name in (first, second)))
             length, u = map(float, numbers)
         except ValueError as error:
-            raise InputError(where, f"'{text}' is not M,N:M,N:LENGTH:U", example) from error
+            raise InputError(where, f"'{text}' is not {form}:LENGTH:U", example) from error
         for mark in marks:
             if not artifact.has(*map(np.array, mark)):
-                known = "write ID,0 of marks in its list" if artifact.marks else (
+                known = "write the ids of marks in its list" if artifact.marks else (
                     f"its marks go from (-{artifact.half[0]}, -{artifact.half[1]}) to "
                     f"{artifact.half}")
                 raise InputError(where, f"the plate has no mark {mark}", known)

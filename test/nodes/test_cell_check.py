@@ -27,6 +27,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions import cell_check
+from test.support.mark_lists import listed_plan
 from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
@@ -103,10 +104,10 @@ def short(monkeypatch):
         monkeypatch.setattr(cell_check, name, seconds)
 
 
-def checked(graph, fault="", checker=(), **cell):
+def checked(graph, fault="", checker=(), plan=None, **cell):
     """Return the node that has checked a cell, and its items by name."""
     graph.node(partial(FaultyCell, fault), servo_sigma=1e-9, use_sim_time=True, **cell)
-    node = graph.node(partial(Checker, small_plan(), settle_s=0.2, patience_s=5.0),
+    node = graph.node(partial(Checker, plan or small_plan(), settle_s=0.2, patience_s=5.0),
                       use_sim_time=True, **dict(checker))
     graph.until(node.finished.done, "the end of the check")
     return node, {item.name: item for item in node.session.items}
@@ -128,6 +129,13 @@ def test_a_good_cell_passes_every_check(graph, sense):
     assert "x -1.00" in items["signs"].figure
     assert "y -1.00" in items["signs"].figure
     assert not any(item.remedy for item in items.values())
+
+
+@pytest.mark.usefixtures("short")
+def test_a_plate_with_a_list_of_marks_is_checked_by_the_innermost(graph):
+    _, items = checked(graph, plan=listed_plan())
+    assert failed(items) == set(), items
+    assert "9 of 9 marks and 8 of 8 lines 2 times" in items["marks"].figure
 
 
 @pytest.mark.usefixtures("short")

@@ -14,6 +14,7 @@ from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
 from test.support.killed import Cell
+from test.support.mark_lists import listed_plan
 from test.support.sessions import collected, events_of, small_plan
 
 VALUES = CollectorSettings.checked({}, "test")
@@ -41,7 +42,15 @@ def run():
     return events_of(small_plan("0, 90, tx", repeats=1))
 
 
-def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_same(cell, run):
+@pytest.fixture(scope="module")
+def run_of_list():
+    return events_of(listed_plan(repeats=1))
+
+
+@pytest.mark.parametrize("which", ["run", "run_of_list"])
+def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_same(
+        cell, which, request):
+    run = request.getfixturevalue(which)
     cell.inside["solver"] = None
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()

@@ -136,7 +136,7 @@ class SolverSettings(ManagedSettings):
         "(indicated - true) / nominal", "m/m", -0.09, 0.09)
     reference_u: float = declared(0.0, "standard uncertainty of that (k=1)", "m/m", 0.0, 0.09)
     reference_marks: str = declared(
-        "", "kind marks: (m, n) of two marks, their distance and its u, M,N:M,N:LENGTH:U (m)")
+        "", "kind marks: marks, distance, its u (m), M,N:M,N:LENGTH:U; of a list ID:ID:LENGTH:U")
     reference_certificate: str = declared("", "certificate of that length: number and issuer")
     reference_at: str = declared(
         "", "temperatures that move it to the measurement, T:U_T:ALPHA:U_ALPHA[:T0] "
