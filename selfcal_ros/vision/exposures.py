@@ -13,6 +13,12 @@ from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.images import Picture, decoded, picture_of
 
+SETTLED = 3
+"""Images in a row that settle the size of all."""
+
+MOST_STAMPS = 100_000
+"""Most stamps that are kept to refuse repeated images: an hour of 30 a second."""
+
 
 @dataclass
 class Counts:
@@ -57,8 +63,8 @@ class ImageDetector:
     def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
         self._detector = MarkDetector(settings, where)
         self.counts = Counts()
-        self._shape: tuple[int, ...] | None = None
-        self._last_ns: int | None = None
+        self._size = _Size()
+        self._stamps: dict[int, None] = {}  # of the images used, in their order
 
     def take(self, message: Any) -> list[Detection]:
         """Return the detections of an image message, row by row.
@@ -66,8 +72,8 @@ class ImageDetector:
         Raises
         ------
         InputError
-            If the image cannot be used, which is counted: unknown encoding, damaged, another size
-            than that of the first one, no later stamp than the one before.
+            If the image cannot be used, which is counted: unknown encoding, damaged, another size,
+            the stamp of an image before.
         """
         return self._detect(lambda: picture_of(message), stamp_ns(message))
 
@@ -82,7 +88,9 @@ class ImageDetector:
         except InputError:
             self.counts.refused += 1
             raise
-        self._shape, self._last_ns = picture.values.shape, stamp
+        self._stamps[stamp] = None
+        if len(self._stamps) > MOST_STAMPS:
+            del self._stamps[next(iter(self._stamps))]
         found, rejected = self._detector.detections(picture, stamp)
         self.counts.images += 1
         self.counts.empty += not found
@@ -91,11 +99,41 @@ class ImageDetector:
         return found
 
     def _check(self, stamp: int, picture: Picture) -> None:
-        """Refuse an image of another size, whose centre is not the axis, and a repeated one."""
-        if self._shape is not None and picture.values.shape != self._shape:
-            old, new = (f"{shape[1]} x {shape[0]}" for shape in (self._shape, picture.values.shape))
-            raise InputError("image", f"{new} pixels, but the first image has {old}",
+        """Refuse a repeated image, and one of another size, whose centre is not the axis.
+
+        Stamps need not ascend: a single one in the future, or a clock that was set back, spoils no
+        other image. Which of them count, the collector judges.
+        """
+        if stamp in self._stamps:
+            raise InputError("image", "its stamp is that of an image before",
+                             "stamp each exposure by its own instant")
+        shape = picture.values.shape
+        if not self._size.agrees(shape):
+            old, new = (f"{size[1]} x {size[0]}" for size in (self._size.shape, shape))
+            raise InputError("image", f"{new} pixels, but the images before have {old}",
                              "record images of one size; the optical axis is their centre")
-        if self._last_ns is not None and stamp <= self._last_ns:
-            raise InputError("image", "its stamp is not later than that of the image before",
-                             "stamp each exposure by its own instant, publish in their order")
+
+
+@dataclass
+class _Size:
+    """The size of the images: that of the first one, unless it was an odd one."""
+
+    shape: tuple[int, ...] = ()
+    used: int = 0
+    other: tuple[int, ...] = ()
+    alike: int = 0
+
+    def agrees(self, shape: tuple[int, ...]) -> bool:
+        """Take the size of an image; return whether it is that of the images.
+
+        The first `SETTLED` images in a row of one size settle it.
+        """
+        self.shape = self.shape or shape
+        if shape != self.shape:
+            self.alike = self.alike + 1 if shape == self.other else 1
+            self.other = shape
+            if self.used >= SETTLED or self.alike < SETTLED:
+                return False
+            self.shape, self.used = shape, self.alike - 1
+        self.used, self.alike = self.used + 1, 0
+        return True

@@ -11,6 +11,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.sessions.detecting import MANY_EMPTY, DetectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.vision import exposures
 
 CAMERA = Camera(width=90, height=80)
 
@@ -66,7 +67,36 @@ def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values,
 
 def test_a_refused_image_is_counted(desk):
     desk.session.take(image(3, drawn()))
-    with pytest.raises(InputError, match="stamp is not later"):
+    with pytest.raises(InputError, match="stamp is that of an image before"):
         desk.session.take(image(3, drawn()))
     assert desk.session.diagnosis().values["images_refused"] == 1
     assert len(desk.sent) == 1
+
+
+def refused(desk, images):
+    """Return which images are refused, by their numbers."""
+    out = []
+    for number, each in enumerate(images):
+        try:
+            desk.session.take(each)
+        except InputError:
+            out.append(number)
+    return out
+
+
+def test_a_stamp_in_the_future_or_a_clock_set_back_costs_no_other_image(desk):
+    stamps = [100, 101, 10**9, 102, 103, 50, 51, 101]
+    assert refused(desk, [image(stamp, drawn()) for stamp in stamps]) == [7]
+    assert [fields["header"]["stamp"]["sec"] for _, fields in desk.sent] == stamps[:7]
+
+
+def test_stamps_are_kept_for_a_while(desk, monkeypatch):
+    monkeypatch.setattr(exposures, "MOST_STAMPS", 3)
+    assert refused(desk, [image(stamp, drawn()) for stamp in (1, 2, 3, 1, 4, 1)]) == [3]
+
+
+def test_an_odd_first_image_does_not_define_the_size(desk):
+    """Three alike settle it; later no number of others does."""
+    sizes = [70, 80, 80, 70, 80, 80, 80, 80, 70, 70, 70, 70, 80]
+    images = [image(number, drawn()[:rows]) for number, rows in enumerate(sizes)]
+    assert refused(desk, images) == [1, 2, 4, 5, 8, 9, 10, 11]
