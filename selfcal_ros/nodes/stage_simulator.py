@@ -127,7 +127,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         """Return the events of a view with images instead of grid detections."""
         assert self.truth is not None and self._camera is not None
         made = exposures(self.truth, plan, self._camera, chain(
-            [replace(command, view=command.placed())], events))
+            [replace(command, view=command.placed())], events), sense=self._cell.sense)
         next(made)  # the command itself
         return made
 

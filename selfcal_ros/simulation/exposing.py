@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.collection.inputs import Command, Detection, Kind
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import Event
@@ -35,12 +36,12 @@ class Exposure:
     angle: float
 
 
-def exposures(truth: Truth, plan: Plan, camera: Camera,
-              events: Iterable[Event]) -> Iterator[Event | Exposure]:
+def exposures(truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event], *,
+              sense: Sense) -> Iterator[Event | Exposure]:
     """Yield `events` with an exposure for all grid detections of a stamp, which name their marks.
 
     The detected marks are at their offsets; the others lie around the first one as on the plate,
-    seen through the same microscope.
+    turned by the yaw of the stage there, seen through the same microscope.
     """
     if truth.artifact.marks:
         raise InputError("camera", "images are rendered of lattices, the plate is a list of marks",
@@ -62,7 +63,8 @@ def exposures(truth: Truth, plan: Plan, camera: Camera,
             yield from found
             continue
         first = next(iter(seen))
-        away = place - place[:, [first]]
+        away, stage = place - place[:, [first]], place[:, [first]]
+        away = physics.with_yaw(truth, sense, -stage if sense is Sense.PLATE_MOVES else stage, away)
         offsets = np.array([seen[first]]).T + physics.seen_offset(truth, away)
         offsets[:, list(seen)] = np.array(list(seen.values())).T
         yield Exposure(found[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle)

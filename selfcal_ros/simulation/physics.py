@@ -256,14 +256,17 @@ def offset_seen(truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndar
     place : float array (2, E)
         Positions of the marks with the stage at 0, m.
     """
-    offset = true_offset(sense, place, stage)
-    if truth.yaw.size:
-        turn = between_sites(truth.artifact, truth.yaw, position)
-        turn = turn if sense is Sense.PLATE_MOVES else -turn  # the microscope instead
-        cosine, sine = np.cos(turn), np.sin(turn)
-        offset = np.stack([cosine * offset[0] - sine * offset[1],
-                           sine * offset[0] + cosine * offset[1]])
-    return seen_offset(truth, offset)
+    return seen_offset(truth, with_yaw(truth, sense, position, true_offset(sense, place, stage)))
+
+
+def with_yaw(truth: Truth, sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return offsets (2, E) as the stage's yaw at positions (2, E) turns them."""
+    if not truth.yaw.size:
+        return offset
+    turn = between_sites(truth.artifact, truth.yaw, position)
+    turn = turn if sense is Sense.PLATE_MOVES else -turn  # the microscope instead
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.stack([cosine * offset[0] - sine * offset[1], sine * offset[0] + cosine * offset[1]])
 
 
 def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:

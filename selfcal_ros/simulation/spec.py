@@ -232,7 +232,8 @@ class Simulation:
         truth = replace(truth, placed=self.placed)
         settings = replace(self.settings, with_ids=True) if self.camera else self.settings
         made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
-        events = list(exposures(truth, self.plan, self.camera, made) if self.camera else made)
+        events = list(exposures(truth, self.plan, self.camera, made, sense=settings.sense)
+                      if self.camera else made)
         arrivals, ledger = apply_faults(events, self.faults, rng)
         return truth, arrivals, ledger
 

@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Detection, Kind
+from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings, plan_events
+from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import AXES, Spread, random_truth
+from selfcal_ros.simulation.rendering import Camera
 from test.simulation.test_physics import (
     PLATE,
     QUARTER,
@@ -129,6 +132,27 @@ def test_it_turns_as_at_its_place():
         seen = physics.offset_seen(truth, Sense.PLATE_MOVES, np.array([[x], [0.0]]),
                                    np.zeros((2, 1)), arm)
         assert seen[0, 0] == pytest.approx(-2e-7 * part, rel=1e-6, abs=1e-15)
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_marks_that_no_cell_is_declared_for_turn_like_the_others(sense):
+    """Rendered around the one that is read, as if the plan had images of 3 x 3 marks."""
+    truth = truth_with(yaw=np.linspace(-2e-3, 2e-3, PLATE.m.size).reshape(PLATE.shape))
+    settings = CellSettings(sense, servo_sigma_m=0.0, stop_sigma_m=0.0, with_ids=True)
+    camera = Camera(width=300, height=300, pixel_size_m=1e-3, mark_size_m=2e-2)
+    found = []
+    for image in (None, Image(3, 3, PLATE.grid_pitch_m)):
+        plan = Plan("yaw", PLATE, (View("v", angular=False, image=image),))
+        events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(1),
+                             start_ns=0)
+        found.append([one.offsets for one in exposures(truth, plan, camera, events, sense=sense)
+                      if isinstance(one, Exposure)])
+    assert len(found[0]) == len(found[1]) == PLATE.m.size
+    turned = 0.0
+    for alone, together in zip(*found, strict=True):
+        np.testing.assert_allclose(alone, together, rtol=0, atol=1e-9)
+        turned = max(turned, np.abs(together - np.round(together / 0.1) * 0.1).max())
+    assert turned > 1e-4
 
 
 def test_each_view_has_its_own_bend():
