@@ -195,11 +195,11 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
     """Return the checks of terms as a table, with the assumptions."""
     lines = ["terms: separable from the stage or not; effect on the map of this size outside the "
              "model;", "probability of detection",
-             f"  {'term':<12}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
+             f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
              f"{'largest':>10} {'detected':>9}"]
     for c in checks:
         told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
-        lines.append(f"  {c.name:<12}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
+        lines.append(f"  {c.name:<13}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
                      f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
                      f" {100 * c.power:7.1f} %")
     return [*lines, *_assumptions(plan, assumed)]

@@ -55,7 +55,7 @@ def views_in(result: CalibrationResult) -> list[View]:
     On the lattice grids are read after quarter turns; else the offset of such a view is known.
     """
     placed = result.plate.map_grid is not None
-    return [View(view.name, view.rotation, (view.translation_x, view.translation_y),
+    return [View(without_cell(view.name), view.rotation, (view.translation_x, view.translation_y),
                  math.isfinite(view.tx) if placed else
                  abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6, angular=False)
             for view in result.views if view.name.endswith(cell_label((0, 0)))
