@@ -21,7 +21,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     unit_rows,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
-from selfcal_ros.estimation.datum.both import BothCovariance
+from selfcal_ros.estimation.datum.plate import BothCovariance
 from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The datum of the angular map: zero mean, or Hu's four axis conditions (eqs. 9, 27).
+"""The angular maps of stage and plate: their datum, and their variances in it.
 
-The four conditions fix one free constant and test three differences. They must not bend the
-XY map, so they act on Gtheta alone, with slopes and rotations from the readings.
+The datum is zero mean, or Hu's four axis conditions (eqs. 9, 27). The four conditions fix one free
+constant and test three differences. They must not bend the XY map, so they act on Gtheta alone,
+with slopes and rotations from the readings.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.covariance import (
+    FieldCovariance,
+    plates_of_terms,
+    scale_by_plate,
+)
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
@@ -21,6 +27,9 @@ MISCLOSURE_LEVEL = 0.05
 
 CLOSED_RAD = 1e-12
 """Misclosure attributed to rounding, rad."""
+
+BLOCK = 512
+"""Number of lines computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,3 +167,124 @@ def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[flo
     spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
     value = float(contrast @ np.linalg.solve(spread, contrast))
     return float(chdtrc(n - 1, value)), float(np.abs(contrast).max())
+
+
+def angular_variance(field: FieldCovariance, conditions: Conditions, *,
+                     sigma: tuple[float, float], half_width_m: float
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure.
+
+    Parameters
+    ----------
+    field : FieldCovariance
+        Covariance of the XY map.
+    conditions : Conditions
+        The angular datum.
+    sigma : tuple of float
+        Noise of one grid reading, m, and of one angular reading, rad.
+    half_width_m : float
+        Length of the unit of the system's positions, m.
+    """
+    system, (sigma_xy, sigma_theta) = field.system, sigma
+    angular, rows, gain = system.angular, conditions.rows, conditions.gain
+    per_phi = sigma_xy**2 / half_width_m**2
+    p_phi = field.inverse[np.ix_(system.phi_at, system.phi_at)] * per_phi
+    y = angular.response
+
+    columns = angular.solve(np.ascontiguousarray(rows.T)) * sigma_theta**2
+    columns = columns + y @ (p_phi @ (y.T @ rows.T))
+    variance = sigma_theta**2 * _inverse_diagonal(system) + np.einsum("ka,ab,kb->k", y, p_phi, y)
+
+    flat = field.project(conditions.slopes.reshape(len(rows), -1).T)
+    n = 3 * system.grid.n_views
+    answer = np.real(system.grid.response.conj().T @ flat) * sigma_xy**2 / half_width_m
+    with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
+    of_slopes = field.of(conditions.slopes) * sigma_xy**2
+
+    turned = field.terms.turned
+    cover = field.terms.covariance * sigma_xy**2
+    sloped = np.real(flat.conj().T @ field.terms.fields)
+    columns = columns + turned @ (cover @ (rows @ turned).T)
+    variance += np.einsum("kp,kp->k", turned @ cover, turned)
+    with_slopes = with_slopes - turned @ (cover @ sloped.T)
+    cross = rows @ with_slopes
+    closure = of_slopes + rows @ columns - cross - cross.T
+    both = with_slopes - columns
+    variance = variance + np.einsum("kc,cd,kd->k", gain, closure, gain)
+    variance = variance + 2 * np.einsum("kc,kc->k", gain, both)
+    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
+
+
+def _inverse_diagonal(system: NormalEquations) -> np.ndarray:
+    n = system.angular.n_lines
+    out = np.empty(n)
+    for start in range(0, n, BLOCK):
+        stop = min(start + BLOCK, n)
+        unit = np.zeros((n, stop - start))
+        unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
+        out[start:stop] = system.angular.solve(unit)[np.arange(start, stop),
+                                                     np.arange(stop - start)]
+    return out
+
+
+def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
+                           lines: tuple[np.ndarray, np.ndarray], sigma: tuple[float, float],
+                           half_width_m: float) -> np.ndarray:
+    """Return the variance of the plate's angular map, (K,), rad^2, in the datum `zero_mean`.
+
+    The rotations of the views are those for which neither stage nor plate is turned.
+
+    Parameters
+    ----------
+    cover : FieldCovariance
+        Covariance of the stage's map.
+    columns : complex array (p, views, nx, ny)
+        Columns of the terms of `cover` at the marks, plate frame.
+    lines : tuple of array
+        Indices of the terms that act on lines, (q,), and their columns (q, views, K), rad.
+    sigma : tuple of float
+        Noise of one grid reading, m, and of one angular reading, rad.
+    half_width_m : float
+        Unit of the positions, m.
+    """
+    system, (sigma_xy, sigma_theta) = cover.system, sigma
+    angular, share = system.angular, system.angular.relative_weight
+    known, count = system.known_lines, system.angular.n_lines
+    noise = (sigma_xy / half_width_m) ** 2
+    dual = system.plate_gauge.dual(2)
+    turn, n = scale_by_plate(system, dual, mode=2), 3 * system.grid.n_views
+    turned = np.zeros(system.size)
+    turned[:n] = np.real(system.grid.response.conj().T @ turn.rows) - turn.parameters
+    total = noise * (turn.variance + float(np.real(
+        np.vdot(turn.rows, system.grid.factor.solve(turn.rows)))))
+    moved = lines_of_terms(cover, lines, half_width_m)
+    if len(columns):
+        plates = plates_of_terms(cover, columns).reshape(len(columns), -1)
+        moved = moved - (np.real(system.gauge.dual(2).reshape(-1).conj() @ cover.terms.fields)
+                         + np.real(plates @ dual.reshape(-1).conj())) / half_width_m
+    weight = angular.weight.sum(axis=0)
+    out = total + sigma_theta**2 / np.where(weight > 0, weight, 1)
+    out = out + np.einsum("kp,pq,kq->k", moved, cover.terms.covariance * sigma_xy**2, moved)
+    for start in range(0, count, BLOCK):
+        here = np.arange(start, min(start + BLOCK, count))
+        rows = np.tile((known / known.sum())[:, None], len(here))
+        for view in range(angular.n_views):
+            rows -= angular.rows(view, here).T * share[view, here]
+        answer = np.tile(turned[:, None], len(here))
+        answer[system.phi_at] -= angular.response.T @ rows + share[:, here]
+        out[here] += sigma_theta**2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
+        out[here] += noise * np.einsum("vl,vw,wl->l", answer, cover.inverse, answer)
+    return np.where(system.known_plate_lines, out, np.nan)
+
+
+def lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
+                    half_width_m: float) -> np.ndarray:
+    """Return the plate's angular map for a unit of each coefficient, (K, p), no rotation taken."""
+    system, field = cover.system, -cover.terms.turned
+    share = system.angular.relative_weight
+    own: np.ndarray = np.zeros((*share.shape, field.shape[1]))
+    for at, values in zip(*lines, strict=True):
+        own[..., at] = values
+    phi = cover.terms.parameters[system.phi_at] / half_width_m
+    found = np.einsum("vk,vkp->kp", share, own - system.angular.gather(field) - phi[:, None])
+    return found + field[system.known_lines].mean(axis=0)

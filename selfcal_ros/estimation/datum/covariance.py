@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
@@ -307,59 +306,10 @@ class FieldCovariance:
         return out[0], out[1]
 
 
-def angular_variance(field: FieldCovariance, conditions: Conditions, *,
-                     sigma: tuple[float, float], half_width_m: float
-                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure.
-
-    Parameters
-    ----------
-    field : FieldCovariance
-        Covariance of the XY map.
-    conditions : Conditions
-        The angular datum.
-    sigma : tuple of float
-        Noise of one grid reading, m, and of one angular reading, rad.
-    half_width_m : float
-        Length of the unit of the system's positions, m.
-    """
-    system, (sigma_xy, sigma_theta) = field.system, sigma
-    angular, rows, gain = system.angular, conditions.rows, conditions.gain
-    per_phi = sigma_xy**2 / half_width_m**2
-    p_phi = field.inverse[np.ix_(system.phi_at, system.phi_at)] * per_phi
-    y = angular.response
-
-    columns = angular.solve(np.ascontiguousarray(rows.T)) * sigma_theta**2
-    columns = columns + y @ (p_phi @ (y.T @ rows.T))
-    variance = sigma_theta**2 * _inverse_diagonal(system) + np.einsum("ka,ab,kb->k", y, p_phi, y)
-
-    flat = field.project(conditions.slopes.reshape(len(rows), -1).T)
-    n = 3 * system.grid.n_views
-    answer = np.real(system.grid.response.conj().T @ flat) * sigma_xy**2 / half_width_m
-    with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
-    of_slopes = field.of(conditions.slopes) * sigma_xy**2
-
-    turned = field.terms.turned
-    cover = field.terms.covariance * sigma_xy**2
-    sloped = np.real(flat.conj().T @ field.terms.fields)
-    columns = columns + turned @ (cover @ (rows @ turned).T)
-    variance += np.einsum("kp,kp->k", turned @ cover, turned)
-    with_slopes = with_slopes - turned @ (cover @ sloped.T)
-    cross = rows @ with_slopes
-    closure = of_slopes + rows @ columns - cross - cross.T
-    both = with_slopes - columns
-    variance = variance + np.einsum("kc,cd,kd->k", gain, closure, gain)
-    variance = variance + 2 * np.einsum("kc,kc->k", gain, both)
-    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
-
-
-def _inverse_diagonal(system: NormalEquations) -> np.ndarray:
-    n = system.angular.n_lines
-    out = np.empty(n)
-    for start in range(0, n, 512):
-        stop = min(start + 512, n)
-        unit = np.zeros((n, stop - start))
-        unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
-        out[start:stop] = system.angular.solve(unit)[np.arange(start, stop),
-                                                     np.arange(stop - start)]
-    return out
+def plates_of_terms(cover: FieldCovariance, columns: np.ndarray) -> np.ndarray:
+    """Return the plate's map for a unit of each coefficient, complex (p, nx, ny), no datum."""
+    grid, of_stage = cover.system.grid, cover.terms
+    fields = of_stage.fields.T.reshape(-1, *grid.views.shape)
+    parameters = of_stage.parameters[:3 * grid.n_views].T
+    return np.array([grid.plate(*one)[0] for one in zip(columns, fields, parameters,
+                                                        strict=True)])

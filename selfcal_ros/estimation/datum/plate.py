@@ -1,30 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertainty of the plate's map.
+"""Uncertainty of the plate's map, and of the maps of stage and plate together.
 
 Stage and plate exchange their parts: a view that lays mark m on site X lays site X on mark m by
-the inverse pose. So the covariance of the plate's map is that of a stage's map in the exchanged
-equations, where the sites are eliminated and the marks are left (method eq. 4.13).
+the inverse pose. So on a lattice the covariance of the plate's map is that of a stage's map in the
+exchanged equations, where the sites are eliminated and the marks are left (method eq. 4.13).
+
+With the plate eliminated (method eq. 4.3), A(m) is the mean of the readings of its mark less what
+stage and misalignments make of them: the noise of that mean is independent of both. So, on a
+lattice or off it, the covariance of all functionals of G and A follows from M, Y and P (method
+eq. 4.14).
 """
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.sparse import csr_matrix, diags
 
 from selfcal_ros.estimation.datum.covariance import (
+    NO_NOISE_M,
     FieldCovariance,
     ScaleDatum,
     TermSpread,
+    plates_of_terms,
     scale_by_plate,
+    scale_of,
     scale_of_plate,
     slope_in_datum,
     without_datum,
 )
 from selfcal_ros.estimation.lattice.maps import PHASES
+from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.systems import Marks, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.view import LatticePose
-
-BLOCK = 512
-"""Number of lines computed at once."""
 
 
 def exchanged(system: NormalEquations) -> NormalEquations:
@@ -98,15 +108,6 @@ def plate_covariance(cover: FieldCovariance, reference: ReferenceLength | None, 
     return FieldCovariance(other, move @ cover.inverse[:n, :n] @ move.T, scale, sigma_m, terms)
 
 
-def plates_of_terms(cover: FieldCovariance, columns: np.ndarray) -> np.ndarray:
-    """Return the plate's map for a unit of each coefficient, complex (p, nx, ny), no datum."""
-    grid, of_stage = cover.system.grid, cover.terms
-    fields = of_stage.fields.T.reshape(-1, *grid.views.shape)
-    parameters = of_stage.parameters[:3 * grid.n_views].T
-    return np.array([grid.plate(*one)[0] for one in zip(columns, fields, parameters,
-                                                        strict=True)])
-
-
 def _of_plate(reference: ReferenceLength | None) -> bool:
     return reference is not None and reference.kind.of_plate
 
@@ -133,64 +134,235 @@ def _scale(system: NormalEquations, other: NormalEquations, reference: Reference
     return scale_by_plate(other, _scale_row(system, reference), u_m)
 
 
-def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
-                           lines: tuple[np.ndarray, np.ndarray], sigma: tuple[float, float],
-                           half_width_m: float) -> np.ndarray:
-    """Return the variance of the plate's angular map, (K,), rad^2, in the datum `zero_mean`.
+BLOCK = 1024
+"""Number of marks computed at once."""
 
-    The rotations of the views are those for which neither stage nor plate is turned.
+
+class BothCovariance:
+    """Covariance of G and A in their datum without terms of the model, for unit noise.
 
     Parameters
     ----------
-    cover : FieldCovariance
-        Covariance of the stage's map.
-    columns : complex array (p, views, nx, ny)
-        Columns of the terms of `cover` at the marks, plate frame.
-    lines : tuple of array
-        Indices of the terms that act on lines, (q,), and their columns (q, views, K), rad.
-    sigma : tuple of float
-        Noise of one grid reading, m, and of one angular reading, rad.
+    system : NormalEquations
+        The measured plan.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit grid noise.
+    reference : ReferenceLength, optional
+        Sets the scale.
     half_width_m : float
         Unit of the positions, m.
+    sigma_m : float
+        Noise of one grid reading.
     """
-    system, (sigma_xy, sigma_theta) = cover.system, sigma
-    angular, share = system.angular, system.angular.relative_weight
-    known, count = system.known_lines, system.angular.n_lines
-    noise = (sigma_xy / half_width_m) ** 2
-    dual = system.plate_gauge.dual(2)
-    turn, n = scale_by_plate(system, dual, mode=2), 3 * system.grid.n_views
-    turned = np.zeros(system.size)
-    turned[:n] = np.real(system.grid.response.conj().T @ turn.rows) - turn.parameters
-    total = noise * (turn.variance + float(np.real(
-        np.vdot(turn.rows, system.grid.factor.solve(turn.rows)))))
-    moved = lines_of_terms(cover, lines, half_width_m)
-    if len(columns):
-        plates = plates_of_terms(cover, columns).reshape(len(columns), -1)
-        moved = moved - (np.real(system.gauge.dual(2).reshape(-1).conj() @ cover.terms.fields)
-                         + np.real(plates @ dual.reshape(-1).conj())) / half_width_m
-    weight = angular.weight.sum(axis=0)
-    out = total + sigma_theta**2 / np.where(weight > 0, weight, 1)
-    out = out + np.einsum("kp,pq,kq->k", moved, cover.terms.covariance * sigma_xy**2, moved)
-    for start in range(0, count, BLOCK):
-        here = np.arange(start, min(start + BLOCK, count))
-        rows = np.tile((known / known.sum())[:, None], len(here))
-        for view in range(angular.n_views):
-            rows -= angular.rows(view, here).T * share[view, here]
-        answer = np.tile(turned[:, None], len(here))
-        answer[system.phi_at] -= angular.response.T @ rows + share[:, here]
-        out[here] += sigma_theta**2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
-        out[here] += noise * np.einsum("vl,vw,wl->l", answer, cover.inverse, answer)
-    return np.where(system.known_plate_lines, out, np.nan)
+
+    def __init__(self, system: NormalEquations, inverse: np.ndarray,
+                 reference: ReferenceLength | None, *, half_width_m: float,
+                 sigma_m: float) -> None:
+        self.system, self.reference, self.length = system, reference, half_width_m
+        n = 3 * system.grid.n_views
+        self._inverse, self._p = inverse, inverse[:n, :n]
+        self._u = 0.0 if reference is None else (
+            reference.u_relative * half_width_m / max(sigma_m, NO_NOISE_M))
+
+    def of(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return the covariance (k, k) of functionals Re(conj(sites) G + conj(marks) A).
+
+        Parameters
+        ----------
+        sites : complex array (k, nx, ny)
+            Factors of the stage's map, frame of the equations.
+        marks : complex array (k, nx, ny)
+            Factors of the plate's map.
+        """
+        count, grid = len(sites), self.system.grid
+        g, a, grown = self._free(sites.reshape(count, -1).T, marks.reshape(count, -1).T)
+        g, moved = self._readings(g, a)
+        answer = np.real(grid.response.conj().T @ g) - moved
+        cov = np.real(g.conj().T @ grid.factor.solve(np.ascontiguousarray(g)))
+        cov += answer.T @ self._p @ answer + np.outer(grown, grown) * self._u**2
+        cov += np.real(a.conj().T @ (self._noise[:, None] * a))
+        return (cov + cov.T) / 2
+
+    def sensitivities(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
+        """Return those of functionals as in `of` to the readings, over their weights, plate frame.
+
+        Complex (k, views, nx, ny).
+        """
+        count, grid = len(sites), self.system.grid
+        g, a, _ = self._free(sites.reshape(count, -1).T, marks.reshape(count, -1).T)
+        g, moved = self._readings(g, a)
+        parameters = self._p @ (moved - np.real(grid.response.conj().T @ g))
+        field = grid.factor.solve(np.ascontiguousarray(g)) - grid.response @ parameters
+        rest = grid.plate(np.zeros(1), field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
+        of_mark = (self._noise[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
+        return np.where(grid.read, of_mark, 0) - rest
+
+    def of_lines(self, stage: np.ndarray, plate: np.ndarray,
+                 sigma: tuple[float, float]) -> np.ndarray:
+        """Return the covariance of functionals of both angular maps without terms, (k, k), rad^2.
+
+        Parameters
+        ----------
+        stage, plate : float array (k, K)
+            Factors of both maps: those of a map add up to 0, as its constant is free.
+        sigma : tuple of float
+            Noise of one grid reading, m, and of one angular reading, rad.
+        """
+        angular, phi = self.system.angular, self.system.phi_at
+        share, total = angular.relative_weight, angular.weight.sum(axis=0)
+        rows = stage.T - angular.scatter(share[..., None] * plate.T)
+        answer = -angular.response.T @ rows - share @ plate.T
+        cover = sigma[1]**2 * (rows.T @ angular.solve(np.ascontiguousarray(rows)) + (
+            plate / np.where(total > 0, total, np.inf)) @ plate.T)
+        cover += (sigma[0] / self.length) ** 2 * (
+            answer.T @ self._inverse[np.ix_(phi, phi)] @ answer)
+        return (cover + cover.T) / 2
+
+    @property
+    def _noise(self) -> np.ndarray:
+        """Variance of the mean of each mark, (marks,); 0 where not read."""
+        total = self.system.grid.weight.sum(axis=0).ravel()
+        return np.where(total > 0, 1 / np.where(total > 0, total, 1.0), 0.0)
+
+    def _free(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return functionals (sites, k), (marks, k) of the maps as those of free maps.
+
+        And the share of the reference's length in each, (k,).
+        """
+        grown = np.zeros(g.shape[1])
+        if self.reference is not None:
+            views = self.system.grid.views
+            grown = np.real(views.z_sites.reshape(-1).conj() @ g
+                            - views.z.reshape(-1).conj() @ a)
+            g, a = (rows + np.outer(scale, grown) for rows, scale in zip(
+                (g, a), self._scale(self.reference), strict=True))
+        return *self._without_datum(g, a), grown
+
+    def _scale(self, reference: ReferenceLength) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scale that a reference sets, as functionals (sites,), (marks,) of the maps."""
+        system, views = self.system, self.system.grid.views
+        if reference.kind.of_plate:
+            return (np.zeros(system.grid.n_sites, dtype=complex),
+                    scale_of_plate(system, reference).reshape(-1))
+        return -slope_in_datum(system, reference.kind), np.zeros(views.z.size, dtype=complex)
+
+    def _without_datum(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return functionals (sites, k), (marks, k) of maps in the datum as those of free maps."""
+        system = self.system
+        a, g = (rows - basis @ np.real(basis.conj().T @ rows) for rows, basis in (
+            (a, system.plate_gauge.orthonormal), (g, system.gauge.orthonormal)))
+        # what the datum takes off the stage as its scale, the plate has
+        grown = np.real(system.grid.views.z.reshape(-1).conj() @ a)
+        return g + np.outer(system.gauge.dual(3).reshape(-1), grown), a
+
+    def _readings(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return functionals of free maps as those of G and of the misalignments alone.
+
+        But for the means of the marks, whose factors are `a`.
+        """
+        grid = self.system.grid
+        out = np.ascontiguousarray(g.T, dtype=complex).reshape(-1, *grid.views.shape)
+        marks = a.T.reshape(-1, *grid.views.plate_shape)
+        moved = np.zeros((grid.n_views, 3, g.shape[1]))
+        for v, part in enumerate(grid.relative_weight):
+            grid.views.add_scattered(out, v, -part * marks)
+            sums = np.einsum("cij,kij->ck", np.conj(grid.shapes), part * marks)
+            moved[v] = -sums[0].real, -sums[1].real, -sums[1].imag
+        return out.reshape(g.shape[1], -1).T, moved.reshape(-1, g.shape[1])
+
+    def maps_of_terms(self, fields: np.ndarray, plates: np.ndarray
+                      ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the maps in the datum for a unit of each coefficient, (sites, p) and (marks, p).
+
+        Parameters
+        ----------
+        fields : complex array (sites, p)
+            Those of the stage, free.
+        plates : complex array (p, nx, ny)
+            Those of the plate, free.
+        """
+        views = self.system.grid.views
+        both = [self._maps(field, plate) for field, plate in zip(
+            fields.T.reshape(-1, *views.shape), plates, strict=True)]
+        g, a = (np.array([pair[part].ravel() for pair in both], dtype=complex).reshape(-1, size)
+                for part, size in enumerate((views.z_sites.size, views.z.size)))
+        return g.T, a.T
+
+    def _maps(self, field: np.ndarray, plate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return free maps (nx, ny) that belong together in the datum, as far as they are known."""
+        system = self.system
+        parts = system.gauge.parts(field)
+        field = system.gauge.remove(field, parts)
+        plate = plate + parts[3] * system.grid.views.z
+        plate = system.plate_gauge.remove(plate, system.plate_gauge.parts(plate))
+        if self.reference is not None:
+            free = replace(self.reference, relative_error=0.0)
+            grown = scale_of(system, free, field=field, plate=plate, half_width_m=self.length)
+            field = field + grown * system.grid.views.z_sites
+            plate = plate - grown * system.grid.views.z
+        return (np.where(system.known_sites, field, 0.0),
+                np.where(system.known_marks, plate, 0.0))
+
+    def placed_diagonal(self, plates: np.ndarray, terms: TermSpread
+                        ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Ax and Ay, (nx, ny) each, for views off the lattice.
+
+        The plate's map in its datum is the free one and a few fields times as many functionals.
+
+        Parameters
+        ----------
+        plates : complex array (p, nx, ny)
+            The plate for a unit of each coefficient, `plates_of_terms`.
+        terms : TermSpread
+            The terms' coefficients.
+        """
+        system, grid = self.system, self.system.grid
+        z, basis = grid.views.z.reshape(-1), system.plate_gauge.orthonormal
+        fields = np.column_stack([-basis, z - basis @ np.real(basis.conj().T @ z)])
+        g = np.column_stack([np.zeros((grid.n_sites, 3)), system.gauge.dual(3).reshape(-1)])
+        a = np.column_stack([basis, np.zeros(len(z))])
+        if self.reference is not None:
+            more = self._without_datum(*(row[:, None] for row in self._scale(self.reference)))
+            fields, g, a = (np.column_stack(pair) for pair in zip(
+                (fields, g, a), (-z, *more), strict=True))
+        rows, moved = self._readings(g, a)
+        parameters = self._p @ (moved - np.real(grid.response.conj().T @ rows))
+        solved = grid.factor.solve(np.ascontiguousarray(rows)) - grid.response @ parameters
+        spread = self._plates(solved, parameters) + self._noise[:, None] * a
+        inner = np.real(g.conj().T @ solved + a.conj().T @ spread)
+        noise = self._noise + _of_nodes(grid)
+        own = self._plates(-grid.response, np.eye(len(self._p)))
+        of_terms, out = self.maps_of_terms(terms.fields, plates)[1], []
+        for part in (np.real, np.imag):
+            b, s, y, t = part(fields), part(spread), part(own), part(of_terms)
+            value = noise + np.einsum("ma,ab,mb->m", y, self._p, y)
+            value += np.einsum("mk,mk->m", b @ inner + 2 * s, b) + (part(z) * self._u) ** 2
+            value += np.einsum("mp,pq,mq->m", t, terms.covariance, t)
+            out.append(np.where(system.known_marks, value.reshape(grid.views.plate_shape), np.nan))
+        return out[0], out[1]
+
+    def _plates(self, fields: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return what maps (sites, k) and misalignments (3 views, k) make of the plate."""
+        grid = self.system.grid
+        maps = fields.T.reshape(-1, *grid.views.shape)
+        plates = grid.plate(np.zeros(grid.weight.shape), maps, parameters.T)[0]
+        return plates.reshape(len(maps), -1).T
 
 
-def lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
-                    half_width_m: float) -> np.ndarray:
-    """Return the plate's angular map for a unit of each coefficient, (K, p), no rotation taken."""
-    system, field = cover.system, -cover.terms.turned
-    share = system.angular.relative_weight
-    own: np.ndarray = np.zeros((*share.shape, field.shape[1]))
-    for at, values in zip(*lines, strict=True):
-        own[..., at] = values
-    phi = cover.terms.parameters[system.phi_at] / half_width_m
-    found = np.einsum("vk,vkp->kp", share, own - system.angular.gather(field) - phi[:, None])
-    return found + field[system.known_lines].mean(axis=0)
+def _of_nodes(grid: GridSystem) -> np.ndarray:
+    """Return the variance of the mean of the stage errors at the sites of each mark, (marks,)."""
+    views = grid.views
+    if not isinstance(views, PlacedViews):
+        raise TypeError("only for views off the lattice")
+    rows = csr_matrix((grid.n_marks, grid.n_sites), dtype=complex)
+    for one, phase, part in zip(views.rows, views.phases, grid.relative_weight, strict=True):
+        rows = rows + diags(part.ravel() * phase.conjugate()) @ one
+    inverse = grid.factor.inverse.reshape(grid.n_sites, *views.shape)
+    half = views.spline.coefficients(inverse).reshape(grid.n_sites, -1)
+    cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
+        grid.n_sites, -1)
+    out = np.zeros(grid.n_marks)
+    for start in range(0, grid.n_marks, BLOCK):
+        here = rows[start:start + BLOCK]
+        out[start:start + BLOCK] = np.real(here.conj().multiply(here @ cover).sum(axis=1)).ravel()
+    return out

@@ -15,20 +15,20 @@ from selfcal_ros.errors import (
     NotIdentifiableError,
     NotSettledError,
 )
-from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
-from selfcal_ros.estimation.datum.both import BothCovariance
+from selfcal_ros.estimation.datum.angular import (
+    angular_plate_variance,
+    angular_variance,
+    conditions_for,
+    lines_of_terms,
+    misclosure_test,
+)
 from selfcal_ros.estimation.datum.covariance import (
     FieldCovariance,
-    angular_variance,
+    plates_of_terms,
     scale_datum,
     scale_of,
 )
-from selfcal_ros.estimation.datum.plate import (
-    angular_plate_variance,
-    lines_of_terms,
-    plate_covariance,
-    plates_of_terms,
-)
+from selfcal_ros.estimation.datum.plate import BothCovariance, plate_covariance
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
 from selfcal_ros.estimation.joint.images import image_noise, kept_images
