@@ -10,8 +10,8 @@ from typing import Any
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.model.view import plan_from_dict
 from selfcal_ros.outputs import write_text
 from selfcal_ros.simulation import spec
 from selfcal_ros.simulation.cell import CellSettings

@@ -28,7 +28,8 @@ from rclpy.node import Node
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.writer import build
 from selfcal_ros.cli.processes import domain, process
 from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.files import read_json

@@ -18,7 +18,6 @@ from pathlib import Path
 import yaml
 from mcap.records import Channel, Schema
 
-from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.journal_file import (
     Content,
     JournalFile,
@@ -27,7 +26,7 @@ from selfcal_ros.bagio.journal_file import (
     records,
     scan_file,
 )
-from selfcal_ros.bagio.schemas import definition_of, store_of_schema
+from selfcal_ros.bagio.schemas import ChannelDecoder, definition_of, store_of_schema
 from selfcal_ros.bagio.writer import Closing, Metadata, Topic, writing
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError

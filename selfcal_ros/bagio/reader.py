@@ -10,10 +10,16 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel
 
-from selfcal_ros.bagio.channels import ChannelDecoder, Input, Waiting
 from selfcal_ros.bagio.mcap_chunk import Block
 from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream
-from selfcal_ros.bagio.schemas import other_field, shorter_stores, store_of_schema
+from selfcal_ros.bagio.schemas import (
+    ChannelDecoder,
+    Input,
+    Waiting,
+    other_field,
+    shorter_stores,
+    store_of_schema,
+)
 from selfcal_ros.collection.clock_steps import Step, StepWatch, future_lines
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.settings.nodes import CollectorSettings

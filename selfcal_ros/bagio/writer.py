@@ -13,11 +13,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 import yaml
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.store import Typestore
 
-from selfcal_ros.bagio.schemas import build, definition_of, hash_of, store_with
+from selfcal_ros.bagio.schemas import definition_of, hash_of, store_with
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages.from_model import Fields
 from selfcal_ros.outputs import temporary_folder, write_text
@@ -280,3 +283,27 @@ class BagWriter(Closing):
         with writing(self.path), self._file:
             self._mcap.finish()
         self._metadata.write(self.path)
+
+
+def build(store: Typestore, typename: str, fields: Fields) -> object:
+    """Return a rosbags message of type `typename` with these fields.
+
+    Raises
+    ------
+    KeyError
+        If a field of the type is missing.
+    """
+    values: dict[str, Any] = {}
+    for name, (kind, argument) in store.fielddefs[typename][1]:
+        value = fields[name]
+        if isinstance(argument, str):  # a type of its own
+            values[name] = build(store, argument, value)
+        elif kind == Nodetype.BASE:
+            values[name] = value
+        else:
+            element = argument[0]
+            if element[0] == Nodetype.BASE and element[1][0] != "string":
+                values[name] = np.array(value, dtype=element[1][0])
+            else:
+                values[name] = list(value)
+    return store.types[typename](**values)

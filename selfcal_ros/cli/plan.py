@@ -30,10 +30,10 @@ from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL
 from selfcal_ros.files import write_yaml
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import parse_order
+from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
-from selfcal_ros.model.view import Plan, plan_to_dict, view_to_dict
+from selfcal_ros.model.view import Plan, parse_order
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.words.tables import plan_budget_text, search_text, step_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M

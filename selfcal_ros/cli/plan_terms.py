@@ -13,7 +13,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.observability.plan_budget import PlanBudget
 from selfcal_ros.estimation.observability.resistance import TermCheck
 from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, Assumed
-from selfcal_ros.model.orders import DEFAULT_ORDER, parse_order
 from selfcal_ros.model.terms import (
     DEFAULT_TERMS,
     DRIFT_DEGREE,
@@ -22,7 +21,7 @@ from selfcal_ros.model.terms import (
     TermName,
     parse_terms,
 )
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import DEFAULT_ORDER, Plan, parse_order
 from selfcal_ros.reporting.words.tables import removal_text
 from selfcal_ros.units import M_PER, MRAD_PER_RAD, RAD_PER, UM_PER_M
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.plan_form import MAX_VIEWS
 from selfcal_ros.model.readings import GridVisits, ViewReadings
-from selfcal_ros.model.view import MAX_VIEWS, View
+from selfcal_ros.model.view import View
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 

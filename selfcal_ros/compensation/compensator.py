@@ -15,7 +15,6 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.compensation.between import error_halfway, share_between
 from selfcal_ros.compensation.cells import (
     MAX_ITERATIONS,
     REST,
@@ -28,7 +27,7 @@ from selfcal_ros.compensation.cells import (
 )
 from selfcal_ros.compensation.circle import MAX_SLOPE, Circle, steep
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, error_halfway, share_between
 
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them gets near twice MAX_SLOPE."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the model to the fields of messages, as plain nested dicts.
 
-`bagio.schemas.build` creates messages of rosbags from them, nodes those of rclpy.
+`bagio.writer.build` creates messages of rosbags from them, nodes those of rclpy.
 """
 
 from collections.abc import Iterable

@@ -20,10 +20,9 @@ from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.marks import marks_of
-from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, parse_order
 from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.orders import DEFAULT_ORDER, VisitOrder, parse_order
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import DEFAULT_ORDER, View, VisitOrder, parse_order
 
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 """Directions of the stage from the mark in check stops, along x and y, in their order."""
@@ -59,7 +58,7 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     artifact, view
         The plate, its pose, and the repeats.
     order : str
-        See `selfcal_ros.model.orders`; empty = that of the view, or else `DEFAULT_ORDER`.
+        See `selfcal_ros.model.view`; empty = that of the view, or else `DEFAULT_ORDER`.
     consecutive : bool
         One pass in which all repeats of a mark are exposed consecutively. If false, every
         repeat is a pass; the passes of the order follow each other cyclically, and the last

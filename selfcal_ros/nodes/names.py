@@ -23,7 +23,7 @@ from std_msgs.msg import String, UInt64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
-from selfcal_ros.model.view import MAX_VIEWS
+from selfcal_ros.model.plan_form import MAX_VIEWS
 from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
-from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.schemas import ChannelDecoder, typestore
 from selfcal_ros.collection.encoder import LOOK_BACK_NS
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError

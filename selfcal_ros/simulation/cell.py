@@ -12,9 +12,8 @@ import numpy as np
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.orders import parse_order
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import Plan, View, parse_order
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.machine import Truth
@@ -46,7 +45,7 @@ class CellSettings:
     encoder_sigma_m, encoder_sigma_theta_rad : float
         Noise of the encoder readings, exposure by exposure, without motion.
     visit_order : str
-        Order of the marks if a view does not specify one (`selfcal_ros.model.orders`).
+        Order of the marks if a view does not specify one (`selfcal_ros.model.view`).
     consecutive : bool
         All repeats of a mark consecutively, in one pass; if false, one pass per repeat.
     stop_sigma_m, stop_sigma_theta_rad : float

@@ -16,7 +16,8 @@ from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
-from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth

@@ -23,7 +23,8 @@ from selfcal_ros.bagio.journal import resume, start, unfinished
 from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError

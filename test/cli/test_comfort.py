@@ -17,9 +17,9 @@ from selfcal_ros.cli.main import VERBS, build_parser, main
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError, did_you_mean, known_are
 from selfcal_ros.files import read_json
+from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.model.view import plan_from_dict
 from selfcal_ros.outputs import write_json
 from test.support.bags import Foreign
 from test.support.results import known_result

@@ -13,8 +13,8 @@ import yaml
 from PIL import Image
 
 from selfcal_ros.bagio.images import ImageBag
-from selfcal_ros.bagio.schemas import build, store_with
-from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.bagio.schemas import store_with
+from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model

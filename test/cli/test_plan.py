@@ -16,7 +16,7 @@ from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.estimation.observability.plan_check import predict_plan
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.view import plan_from_dict
+from selfcal_ros.model.plan_form import plan_from_dict
 
 PLANS = sorted((Path(__file__).parents[2] / "config" / "plans").glob("*.yaml"))
 

@@ -14,8 +14,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.marks import marks_of
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import ViewReadings, placing_digest
-from selfcal_ros.model.view import View, plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import visit_sequence
 from selfcal_ros.sessions.watching import plate_picture
 from test.messages.test_convert import through_cdr

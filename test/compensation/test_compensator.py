@@ -5,12 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
-from selfcal_ros.compensation.between import error_halfway
 from selfcal_ros.compensation.cells import bicubic_cells, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, error_halfway
 from test.support.maps import random_map
 
 ARTIFACT = Artifact(11, 0.01, 24)

@@ -14,8 +14,9 @@ from selfcal_ros.estimation.observability.suggest import rank_next
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import Plan, View
 from test.support.options import BARE, bare
 from test.support.truth import Spread, random_truth, simulate_measurements
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.timeline import Timeline
@@ -17,16 +18,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import ORDERS
-from selfcal_ros.model.readings import (
-    GridVisits,
-    Measurements,
-    RepeatMotion,
-    Sense,
-    ViewReadings,
-)
+from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion, Sense, ViewReadings
 from selfcal_ros.model.verdict import Grade, Verdict
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import ORDERS, View
 from test.support.bags import contract_message, contract_types
 from test.support.plans import image_plan
 from test.support.results import known_result

@@ -9,7 +9,8 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
-from selfcal_ros.model.view import View, plan_from_dict, plan_to_dict, with_sub_views
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import View, with_sub_views
 
 PLATE = Artifact(11, 0.01, 24)
 PLAN = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 24},

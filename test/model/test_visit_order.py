@@ -9,8 +9,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.orders import ORDERS, VisitOrder, parse_order
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import ORDERS, View, VisitOrder, parse_order
 from selfcal_ros.model.visit_order import approach_signs, check_marks, visit_sequence
 
 PLATE = Artifact(3, 0.01, 0, 5)

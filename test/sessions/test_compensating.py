@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.writer import build
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model

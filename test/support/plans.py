@@ -5,7 +5,8 @@ import math
 from collections.abc import Sequence
 
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import Plan, View, plan_from_dict
+from selfcal_ros.model.plan_form import plan_from_dict
+from selfcal_ros.model.view import Plan, View
 
 POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "tx": (0, 1, 0),
          "+tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "-ty": (0, 0, -1),

@@ -2,7 +2,8 @@
 """Ports of a session that a test holds in its hands: what was published, said, and the time."""
 
 
-from selfcal_ros.bagio.schemas import build, typestore
+from selfcal_ros.bagio.schemas import typestore
+from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
 from selfcal_ros.sessions.health import Level, Ports
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal_ros.bagio.channels import ChannelDecoder
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.bagio.schemas import build, typestore
-from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.bagio.schemas import ChannelDecoder, typestore
+from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.model.plan_form import plan_to_dict
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.view import Plan, plan_to_dict
+from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.bag import event_fields, write_simulation
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation

@@ -10,10 +10,11 @@ from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLeng
 from selfcal_ros.files import csv_cells, read_text, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
-from selfcal_ros.model.view import Plan, plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import Plan
 from selfcal_ros.results import read_result
 
 MOST_BYTES = 4_000_000

@@ -10,11 +10,7 @@ from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
-from selfcal_ros.estimation.observability.rank import (
-    full_observability,
-    identifies,
-    with_unchecked,
-)
+from selfcal_ros.estimation.observability.rank import full_observability, identifies, with_unchecked
 from selfcal_ros.estimation.observability.unseen import (
     UnseenMode,
     angular_families,
@@ -26,9 +22,8 @@ from selfcal_ros.estimation.observability.unseen import (
 )
 from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import ORDERS, parse_order
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.view import Plan, View, with_sub_views
+from selfcal_ros.model.view import ORDERS, Plan, View, parse_order, with_sub_views
 from selfcal_ros.units import MM_PER_M
 
 SEARCH_SIZE = 9

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.compensation.between import CELL_MEAN, error_halfway
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
@@ -21,7 +20,7 @@ from selfcal_ros.estimation.joint.solved import (
     rounded,
     variance_of_terms,
 )
-from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult

@@ -15,7 +15,8 @@ from selfcal_ros.estimation.observability.any_pose import (
 )
 from selfcal_ros.estimation.observability.suggest import best_plan, rank_next, score_plan
 from selfcal_ros.model.artifact import Artifact, MapGrid
-from selfcal_ros.model.view import Plan, View, plan_from_dict, plan_to_dict
+from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
+from selfcal_ros.model.view import Plan, View
 
 PLATE = Artifact(11, 0.01, 0, map_grid=MapGrid(7, 0.1 / 6))
 PLAN = Plan("aslant", PLATE, (View("first", angular=False, repeats=2),

@@ -14,10 +14,9 @@ from selfcal_ros.estimation.observability.plan_check import check_plan, predict_
 from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import NOMINAL_SIZES, ModelTerm, TermName, parse_terms
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import ORDERS, View
 from selfcal_ros.model.visit_order import visit_sequence
 from test.support.dense_terms import SIGMA, Dense
 from test.support.plans import plan_of

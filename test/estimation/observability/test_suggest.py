@@ -27,9 +27,8 @@ from selfcal_ros.estimation.observability.suggest import (
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.orders import ORDERS
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import ORDERS, View
 from selfcal_ros.reporting.words.tables import search_text, step_text
 from test.support.dense_terms import Dense
 from test.support.options import BARE, bare

@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.compensation.between import CELL_MEAN, error_halfway, share_between
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import CELL_MEAN, ErrorMap, error_halfway, share_between
 
 PITCH_M, NOISE_M, WAVES = 0.01, 1e-9, 12
 

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of views in the form of a PLAN.yaml, checked, and back."""
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import checked_fields
+from selfcal_ros.model.artifact import (
+    Artifact,
+    artifact_of,
+    artifact_to_dict,
+    default_map_grid,
+    harmonics_of,
+    map_grid_of,
+    map_to_dict,
+)
+from selfcal_ros.model.pose import image_of, turn_in_lines
+from selfcal_ros.model.terms import terms_of, with_microscope
+from selfcal_ros.model.view import Plan, View, parse_order, with_sub_views
+from selfcal_ros.units import MM_PER_M
+
+MAX_VIEWS = 1000
+"""Largest number of views of a plan."""
+
+
+def plan_from_dict(data: object, where: str) -> Plan:
+    """Return the plan in a PLAN.yaml mapping.
+
+    Parameters
+    ----------
+    data : object
+        Parsed YAML: ``plan_id``, ``artifact`` as `artifact_of` takes it,
+        ``views [{name, rotation_deg, translation_pitch, grid, angular, repeats, visit_order}]``,
+        with ``translation_mm`` instead of ``translation_pitch``, ``visit_order``, for views without
+        their own, ``map {grid_size, grid_pitch, interpolation, grid_size_y, harmonics}``, nodes
+        off the plate's sites (default off the lattice: `default_map_grid`), harmonics of the
+        angular map, ``model_terms``, each ``TERM`` or ``TERM:SIZE``, ``check_stops {marks,
+        offset}`` (m) of views with grid marks, ``microscope {scale_u, rotation_u, shear_u}`` (u),
+        ``image {nx, ny, pitch_m}``, and ``artifact_from``, which made the plate known.
+    where : str
+        File name, for messages.
+
+    Raises
+    ------
+    InputError
+        For a missing or unknown key, a wrong type, an unknown visiting order or term, or an
+        impossible pose.
+    """
+    fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
+                            {"visit_order": (str, ""), "model_terms": (list, []),
+                             "check_stops": (dict, {}), "microscope": (dict, {}),
+                             "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, "")})
+    artifact = replace(artifact_of(fields["artifact"], f"{where}: artifact"),
+                       harmonics=harmonics_of(fields["map"], f"{where}: map"))
+    order = _order(fields["visit_order"], where)
+    if len(fields["views"]) > MAX_VIEWS:
+        raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
+                         f"{MAX_VIEWS}", "measure fewer views")
+    checks = _checks(fields["check_stops"], f"{where}: check_stops")
+    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
+                  for index, view in enumerate(fields["views"]))
+    grid = map_grid_of(fields["map"], artifact, f"{where}: map")
+    if grid is None and not all(view.is_on_lattice(artifact) for view in views):
+        grid = default_map_grid(artifact)
+    artifact = replace(artifact, map_grid=grid)
+    image = image_of(fields["image"], artifact, f"{where}: image")
+    views = tuple(replace(_with_checks(view, *checks, artifact, where),
+                          image=image if view.grid else None) for view in views)
+    if len(with_sub_views(views)) > MAX_VIEWS:
+        raise InputError(f"{where}: image", f"{len(with_sub_views(views))} views with the cells of "
+                         f"the image are more than {MAX_VIEWS}", "state fewer marks in an image")
+    if not views:
+        raise InputError(where, "the plan has no views", "add at least one view")
+    for index, view in enumerate(views):
+        if view.name in [other.name for other in views[:index]]:
+            raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
+                             "give every view its own name")
+    terms = terms_of(fields["model_terms"], where)
+    return Plan(fields["plan_id"], artifact, views, with_microscope(
+        terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"])
+
+
+def _checks(data: dict, where: str) -> tuple[int, float]:
+    """Return the number of marks checked and their distance, m; (0, 0) if none."""
+    if not data:
+        return 0, 0.0
+    if isinstance(data.get("offset"), str):  # YAML reads 20e-6, without a point, as a string
+        with suppress(ValueError):  # refused below
+            data = data | {"offset": float(data["offset"])}
+    raw = checked_fields(data, where, {"marks": int, "offset": float})
+    return raw["marks"], raw["offset"]
+
+
+def _with_checks(view: View, marks: int, offset_m: float, artifact: Artifact, where: str) -> View:
+    """Return the view with check stops if it has grid marks; InputError for an impossible pose."""
+    view.on_stage(artifact)
+    if not view.grid:
+        return view
+    checked = replace(view, check_marks=marks, check_offset_m=offset_m)
+    try:
+        checked.require_check_stops(artifact)
+    except InputError as error:
+        raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
+    return checked
+
+
+def _order(text: str, where: str) -> str:
+    return str(parse_order(text, f"{where}: visit_order")) if text else ""
+
+
+def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) -> View:
+    raw = checked_fields(data, where, {"name": str},
+                         {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
+                          "translation_mm": (list, None), "grid": (bool, True),
+                          "angular": (bool, None), "repeats": (int, 1),
+                          "visit_order": (str, order)})
+    a, b = _translation_m(raw, where, artifact)
+    if raw["repeats"] < 1:
+        raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
+    if raw["angular"] and not artifact.angular_count:
+        raise InputError(where, "angular marks are wanted but the plate has none",
+                         "set angular to false")
+    turn = math.radians(raw["rotation_deg"])
+    if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines
+        raw["angular"] = artifact.angular_count > 0 and (
+            not raw["grid"] or not math.isfinite(turn) or turn_in_lines(turn, artifact) is not None)
+    if not (raw["grid"] or raw["angular"]):
+        raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
+    return View(raw["name"], turn, (a, b), raw["grid"], raw["angular"], raw["repeats"],
+                _order(raw["visit_order"], where))
+
+
+def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
+    """Return the translation of a view in PLAN.yaml, m; (0, 0) if it has none."""
+    given = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
+    if len(given) > 1:
+        raise InputError(where, f"{' and '.join(given)} are given", "leave one of them out")
+    if given == ["translation_pitch"] and artifact.marks is not None:
+        raise InputError(f"{where}: translation_pitch", "a list of marks has no pitch",
+                         "give translation_mm: [a, b]")
+    shift = raw[given[0]] if given else [0, 0]
+    if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
+        raise InputError(f"{where}: {given[0]}", "not two numbers", "give [a, b]")
+    if given == ["translation_mm"]:
+        return shift[0] / MM_PER_M, shift[1] / MM_PER_M
+    return shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m
+
+
+def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
+    """Return a view in the format of PLAN.yaml."""
+    unit = "pitch" if artifact.marks is None else "mm"
+    shift = view.on_stage(artifact).shift if unit == "pitch" else [
+        value * MM_PER_M for value in view.translation_m]
+    order = {"visit_order": view.visit_order} if view.visit_order else {}
+    return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
+            f"translation_{unit}": [round(step, 9) for step in shift], "grid": view.grid,
+            "angular": view.angular, "repeats": view.repeats, **order}
+
+
+def plan_to_dict(plan: Plan) -> dict[str, Any]:
+    """Return a plan in the format of PLAN.yaml."""
+    artifact, own = plan.artifact, map_to_dict(plan.artifact)
+    marks, offset_m = plan.check_stops
+    image = next((view.image for view in plan.views if view.image), None)
+    return {"plan_id": plan.plan_id, "artifact": artifact_to_dict(artifact),
+            **({"map": own} if own else {}),
+            "views": [view_to_dict(view, artifact) for view in plan.views],
+            **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
+            **({"image": dict(vars(image))} if image else {}),
+            **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
+            **({"artifact_from": plan.artifact_from} if plan.artifact_from else {})}
