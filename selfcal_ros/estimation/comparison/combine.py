@@ -25,7 +25,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     remaining_part,
 )
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, remove_modes, rms
 from selfcal_ros.model.result import (
     COMBINED,
     PRIOR,
@@ -51,17 +51,31 @@ DEGREE = 3
 """Degree up to which each polynomial of a map may vary between runs by its own."""
 HARMONICS = 3
 """The same of the angular map, waves per turn."""
+SAME = 1e-3
+"""Difference of two maps, rms over u, below which they are of the same readings: two recordings
+repeat each other no better than their noise."""
+OTHER_UNIT = 300.0
+"""How many times larger the errors in a table are that is not in m or rad."""
 MAX_STORED = 2 * 21 * 21
 """Largest number of coordinates whose covariance is stored: 3.5 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A map to be combined: its file, and its calibration; None for a map of other origin."""
+    """A map to be combined: its file, and its calibration; None for a map of other origin.
+
+    `source` is the calibration behind it, also if the map itself was read from a table.
+    """
 
     name: str
     error_map: ErrorMap
     result: CalibrationResult | None = None
+    source: CalibrationResult | None = None
+
+    @property
+    def origin(self) -> CalibrationResult | None:
+        """The calibration behind the map, if it is known."""
+        return self.result or self.source
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +120,9 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
         raise InputError(parts[-1].name, f"{int(known.sum())} sites are known with their "
                          "uncertainty in all maps", "combine maps that overlap")
     artifact = first.artifact
-    modes = datum_modes(artifact, scale=not keep_scale)[:, :, known]
+    modes = datum_modes(artifact, scale=not keep_scale)
+    _require_own_readings(parts, known, modes)
+    modes = modes[:, :, known]
     xy = mean_of([_xy_run(part, known, keep_scale=keep_scale) for part in parts],
                  modes.reshape(len(modes), -1).T, _polynomials(artifact.x_m, artifact.y_m, known))
     lines = np.logical_and.reduce([np.isfinite(part.error_map.g_theta + part.error_map.u_g_theta)
@@ -127,27 +143,69 @@ def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
     if len(parts) < 2 or not own:
         raise InputError(parts[0].name if parts else "RESULT.json", "a single map, or no "
                          "RESULT.json among them", "give two or more, one of them a RESULT.json")
-    digests = [part.result.input.get("sha256") for part in own if part.result]
-    for index, part in enumerate(own):
+    for part in own:
         require_same_lattice(own[0].error_map.artifact, part.error_map.artifact,
                              (own[0].name, part.name))
         result = part.result
         if result is None or not result.verdict.qualified:
             raise InputError(part.name, "its calibration is not qualified", "leave it out")
-        if PRIOR in result.extra:
-            raise InputError(part.name, "a prior is part of its map, the same in every run",
-                             "solve it without a prior")
-        if result.method == COMBINED:
-            raise InputError(part.name, "a mean of several runs", "name these runs themselves")
-        if digests[index] and digests[index] in digests[:index]:
-            raise InputError(part.name, "calibrated from the same bag as "
-                             f"{own[digests.index(digests[index])].name}", "leave one of them out")
         if keep_scale and result.reference is None:
             raise InputError("--keep-scale", f"{part.name} has no reference length, so its "
                              "magnification is unknown", "omit it, or solve with --reference")
+    for index, part in enumerate(parts):
+        _require_single_run(part, parts[:index])
     found = own[0].result
     assert found is not None
     return found
+
+
+def _require_single_run(part: Part, others: Sequence[Part]) -> None:
+    """Refuse a map that is not of one recording alone, or of that of another map."""
+    result = part.origin
+    if result is None:
+        return
+    if PRIOR in result.extra:
+        raise InputError(part.name, "a prior is part of its map, the same in every run",
+                         "solve it without a prior")
+    if result.method == COMBINED:
+        raise InputError(part.name, "a mean of several runs", "name these runs themselves")
+    for other in others:
+        if other.origin is not None and _same_recording(result, other.origin):
+            raise InputError(part.name, f"of the same recording as {other.name}",
+                             "leave one of them out")
+
+
+def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
+    """Whether two results are of one bag, or of one run at the same time with the same noise."""
+    digest = one.input.get("sha256")
+    if digest and digest == other.input.get("sha256"):
+        return True
+    run, also = ((result.run_id, result.provenance.extra.get("first_exposure"),
+                  result.provenance.extra.get("last_exposure")) for result in (one, other))
+    return all(run) and run == also and bool(np.isclose(
+        one.noise.sigma_xy_repeats, other.noise.sigma_xy_repeats, rtol=SAME, atol=0.0,
+        equal_nan=True))
+
+
+def _require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.ndarray) -> None:
+    """Refuse a map that is equal to another one but for its datum, or is in another unit."""
+    emaps = [part.error_map for part in parts]
+    u = [np.stack([emap.u_gx, emap.u_gy]) for emap in emaps]
+    maps = [remove_modes(np.where(known, np.stack([emap.gx, emap.gy]), np.nan), modes)
+            for emap in emaps]
+    lines = [np.diff(emap.g_theta) for emap in emaps]
+    first = next(index for index, part in enumerate(parts) if part.result is not None)
+    for index, part in enumerate(parts):
+        for values, unit, own in ((maps, "µm", u[first]),
+                                  (lines, "µrad", emaps[first].u_g_theta)):
+            ratio = rms(values[index]) / max(rms(values[first]), rms(own))
+            if part.result is None and ratio > OTHER_UNIT:
+                raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
+                                 f"{parts[first].name}: is it in {unit}?", "give m and rad")
+        for other in range(index):
+            if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
+                raise InputError(part.name, f"of the same readings as {parts[other].name}: their "
+                                 "maps are equal", "leave one of them out")
 
 
 def _xy_run(part: Part, known: np.ndarray, *, keep_scale: bool) -> Run:

@@ -49,6 +49,26 @@ def part(name, result):
     return Part(name, result.error_map, result)
 
 
+def run_at(run_id, **changed):
+    """Return run A with another map, and what tells when it was recorded."""
+    times = dict.fromkeys(("first_exposure", "last_exposure"), "2026-01-01T00:00:00+00:00")
+    return replace(A, run_id=run_id, error_map=replace(A.error_map, **changed),
+                   provenance=replace(A.provenance, extra=times))
+
+
+def thrice(result):
+    """Return a run three times, apart by a tenth of u: equal maps are of one recording."""
+    off = 0.1 * result.error_map.u_gx
+    return [part(name, replace(result, error_map=replace(
+        result.error_map, gx=result.error_map.gx + sign * off)))
+        for name, sign in zip("abc", (1, -1, 0), strict=True)]
+
+
+def scaled(emap, by):
+    return replace(emap, **{name: by * getattr(emap, name) for name in ("gx", "gy", "u_gx",
+                                                                        "u_gy")})
+
+
 A, B, C = (calibrated(seed) for seed in (1, 2, 3))
 
 
@@ -134,7 +154,7 @@ def test_the_datum_of_a_run_changes_nothing():
 
 
 def test_three_equal_runs_give_their_map_with_a_third_of_the_variance():
-    found = combine([part(name, replace(A, input={})) for name in "abc"]).result
+    found = combine(thrice(A)).result
     np.testing.assert_allclose(found.error_map.gx, A.error_map.gx, atol=1e-18)
     np.testing.assert_allclose(found.error_map.g_theta, A.error_map.g_theta
                                - A.error_map.g_theta.mean(), atol=1e-18)
@@ -170,7 +190,7 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
     result = calibrate(simulate_measurements(
         truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True),
         Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")))
-    found = combine([part(name, result) for name in "abc"])
+    found = combine(thrice(result))
     factors = np.array(result.extra["covariance_terms"]["factors"])
     of = np.array(result.extra["covariance_terms"]["terms"]) == "microscope"
     assert of.any()
@@ -220,7 +240,8 @@ def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
 def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     """Twice the u of the calibration: a fifth of the weight of both."""
     emap = A.error_map
-    other = replace(emap, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy, u_g_theta=2 * emap.u_g_theta)
+    other = replace(thrice(A)[0].error_map, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy,
+                    u_g_theta=2 * emap.u_g_theta)
     found = combine([part("a", A), Part("b", other)])
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
     np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
@@ -317,7 +338,18 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
     ([part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
      "b: its calibration is not qualified"),
     ([part("a", replace(A, input={"sha256": "1"})), part("b", replace(A, input={"sha256": "1"}))],
-     "b: calibrated from the same bag as a"),
+     "b: of the same recording as a"),
+    ([part("a", A), part("b", replace(A, run_id="other"))],
+     "b: of the same readings as a: their maps are equal"),
+    ([part("a", run_at("1")), part("b", run_at("1", gx=B.error_map.gx))],
+     "b: of the same recording as a"),
+    ([part("a", run_at("1")), Part("b", B.error_map, source=run_at("1"))],
+     "b: of the same recording as a"),
+    ([part("a", A), Part("b", B.error_map, source=replace(A, method="combined"))],
+     "b: a mean of several runs"),
+    ([part("a", A), Part("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
+    ([part("a", A), Part("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
+     r"b: .* of a: is it in µrad\?"),
     ([part("a", A), part("b", calibrated(1, artifact=Artifact(5, 0.01, 12)))],
      "the lattices differ"),
     ([part("a", A), part("b", replace(B, error_map=replace(
@@ -326,6 +358,20 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
 def test_what_cannot_be_combined_is_refused(parts, message):
     with pytest.raises(InputError, match=message):
         combine(parts)
+
+
+def test_runs_at_the_same_simulated_time_are_told_apart_by_their_noise():
+    noise = replace(A.noise, sigma_xy_repeats=1.1 * A.noise.sigma_xy_repeats)
+    other = replace(run_at("1", gx=B.error_map.gx), noise=noise)
+    assert combine([part("a", run_at("1")), part("b", other)]).result.verdict.qualified
+
+
+def test_a_table_as_coarse_as_its_errors_is_no_other_unit():
+    """A map of a tenth of the accuracy is combined; its errors are larger, as its u says."""
+    rng, u = np.random.default_rng(1), 20 * A.error_map.u_gx
+    coarse = replace(A.error_map, gx=A.error_map.gx + rng.normal(0, u),
+                     gy=A.error_map.gy + rng.normal(0, u), u_gx=u, u_gy=u)
+    assert combine([part("a", A), Part("b", coarse)]).xy.weights[0] > 0.99
 
 
 def test_sets_of_runs_differ_by_their_seed_alone():
