@@ -316,10 +316,28 @@ def _yaw_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> No
     phases = [nominal if view is None else view.phase
               for view, nominal in zip(ground.visits, ground.yaw.phases, strict=True)]
     here = ground.weight.reshape(len(phases), -1) > 0
-    for node, means in enumerate(ground.yaw.columns(phases)):
+    for node, means in enumerate(ground.yaw.columns(phases, _beside_cells(ground))):
         shape = made.add({view: values * here[view] for view, values in means.items()},
                          [None] * len(phases))
         made.column(Column(term.name, -1, f"node {node}", term.size), shape, 1)
+
+
+def _beside_cells(ground: TermInputs) -> np.ndarray:
+    """Return where marks are beside the places of their cells, stage axes, (views, marks), m.
+
+    Of a cell the mean is that on the optical axis: its own holds the camera's error there.
+    """
+    out = np.zeros((len(ground.names), ground.z.size), dtype=complex)
+    mean = np.zeros(len(out), dtype=complex)
+    for row, visits in enumerate(ground.visits):
+        if visits is not None:
+            mean[row] = visits.offset.mean()
+            out[row, visits.mark] = visits.means(visits.offset[None], ground.z.size)[0, visits.mark]
+    for members in ground.members.values():
+        axis = [row for row in members if ground.yaw is not None and not ground.yaw.arms[row]]
+        out[members] += np.where(out[members], (mean[axis[0]] if axis else 0) - mean[
+            members, None], 0)
+    return out
 
 
 def _plate_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:

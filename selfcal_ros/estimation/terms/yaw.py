@@ -51,21 +51,26 @@ class StageYaw:
             self.half_m, self.shape, strict=True))
         return (x[:, None] + 1j * y).ravel()
 
-    def columns(self, phases: Sequence[complex] | None = None) -> Iterator[dict[int, np.ndarray]]:
+    def columns(self, phases: Sequence[complex] | None = None,
+                beside: np.ndarray | None = None) -> Iterator[dict[int, np.ndarray]]:
         """Yield the readings of all marks for a yaw of 1 rad at each node, by view, plate frame.
 
-        `phases` replace those of the nominal poses.
+        `phases` replace those of the nominal poses; `beside`, (views, marks), is where the marks
+        are beside the places of their cells, stage axes, m: a constant yaw, a turn of the camera,
+        does not act on it.
         """
         nx, ny = self.shape
         x, y = (np.clip((part / half + 1) / 2, 0, 1) * (n - 1) for part, half, n in zip(
             (self.places.real, self.places.imag), self.half_m, self.shape, strict=True))
-        turned = -1j * self.arms * (self.phases if phases is None else np.array(phases))
-        seen = np.flatnonzero(self.arms)
+        unit = -1j * (self.phases if phases is None else np.array(phases))[:, None]
+        turned = unit * (self.arms[:, None] + (0 if beside is None else beside))
+        constant = unit * (0 if beside is None else beside) / (nx * ny)
+        seen = np.flatnonzero(turned.any(axis=1))
         for i in range(nx):
             along = np.maximum(1 - np.abs(x - i), 0)
             for j in range(ny):
                 weight = along * np.maximum(1 - np.abs(y - j), 0)
-                yield {view: turned[view] * weight[view] for view in seen.tolist()}
+                yield {view: turned[view] * weight[view] - constant[view] for view in seen.tolist()}
 
 
 def stage_yaw(artifact: Artifact, views: Sequence[View]) -> StageYaw | None:

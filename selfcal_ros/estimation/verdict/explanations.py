@@ -286,7 +286,9 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     taken[:len(model.coefficients)] = model.coefficients
     right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
-    prior = np.where(columns.rows(own), equations.prior(model.found.xy.sigma), 0.0)
+    # images determine the yaw: no other cause may gain from a size that is too small for it
+    sized = columns.rows([name for name in own if name is not TermName.YAW])
+    prior = np.where(sized, equations.prior(model.found.xy.sigma), 0.0)
     excess = noise_excess(problem, model.found.residuals)
     common = excess * model.found.xy.residuals**2 if problem.images else 0.0
     return select_explanations(Candidates(equations, right, prior, taken, excess, common), groups,

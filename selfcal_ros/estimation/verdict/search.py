@@ -208,7 +208,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
         if solved is None or solved.xy.contradicted or solved.theta.contradicted:
             continue
         emap = solved.result.error_map
-        u = rms(np.stack([emap.u_gx, emap.u_gy])) + rms(np.nan_to_num(emap.u_g_theta))
+        u = rms(np.stack([emap.u_gx, emap.u_gy])) + np.nan_to_num(rms(emap.u_g_theta))
         again = search_causes(solved, measurements, replace(
             options, terms=merged(options.terms, terms)), failed=False, advise=False)
         if not again.causes and u < least:
