@@ -5,13 +5,12 @@ The stage moves from mark to mark, dwells, and the microscope exposes in the mid
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, parse_order
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
@@ -153,18 +152,6 @@ class GridExposures:
     approach: np.ndarray
     site: np.ndarray
     others: tuple["Seen", ...] = ()
-
-    def of_cell(self, artifact: Artifact, sub_view: View) -> "GridExposures":
-        """Return the exposures as those of the marks in a cell, offsets from its place."""
-        if sub_view.cell is None:
-            return self
-        seen = next((one for one in self.others if one.cell == sub_view.cell), None) or Seen(
-            (0, 0), self.offset, np.stack([self.visits.m, self.visits.n]), self.there)
-        m, n = seen.mark
-        site = np.stack(sub_view.on_stage(artifact).site_of(m, n)) * artifact.grid_pitch_m
-        place = np.array([[sub_view.cell_m.real], [sub_view.cell_m.imag]])
-        return replace(self, visits=replace(self.visits, m=m, n=n), offset=seen.offset - place,
-                       mark=seen.mark, there=seen.there, site=site, others=())
 
 
 @dataclass(frozen=True, eq=False)

@@ -268,13 +268,6 @@ class Truth:
     waves: Waves = NO_WAVES
     waves_theta: Waves = NO_WAVES
 
-    @property
-    def by_visit(self) -> bool:
-        """Whether visits of a mark differ by more than noise."""
-        return bool(self.placed) or any(np.any(values) for values in (
-            self.microscope, self.wiring - np.eye(2), self.line_factor - 1, self.distortion,
-            self.backlash_m, self.backlash_growth_m, self.settling_m, self.drift_m, self.walk_m))
-
     def placed_as(self, index: int, commanded: View) -> View:
         """Return the pose of the plate in view `index`."""
         return (self.placed[index] if index < len(self.placed) else None) or commanded

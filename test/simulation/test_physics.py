@@ -17,7 +17,12 @@ from selfcal_ros.model.visit_order import visit_sequence
 from selfcal_ros.simulation.cell import CellSettings, flicker_noise, grid_exposures, quantised
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import encoder_error, line_directions, stage_error
-from test.support.truth import angular_deviation, grid_deviation, simulate_measurements
+from test.support.truth import (
+    angular_deviation,
+    differs_by_visit,
+    grid_deviation,
+    simulate_measurements,
+)
 
 PLATE = Artifact(3, 0.1, 4)
 SENSES = pytest.mark.parametrize("sense", list(Sense))
@@ -340,12 +345,12 @@ def test_what_is_drawn_has_the_size_that_is_asked_for():
     np.testing.assert_allclose(truth.walk_m[:, :, [64, -1]].std(axis=0), [[2.5e-8, 5e-8]] * 2,
                                rtol=0.05)
     np.testing.assert_array_equal(truth.backlash_m, [1e-8, -2e-8])
-    assert truth.by_visit
+    assert differs_by_visit(truth)
 
 
 def test_nothing_beyond_the_basic_model_is_drawn_unasked():
     truth = random_truth(PLATE, 4, np.random.default_rng(5))
-    assert not truth.by_visit
+    assert not differs_by_visit(truth)
     assert not (truth.plate_scale.size or truth.plate_shape_m.size)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from selfcal_ros.collection.marks.repeats import repeat_motion
 from selfcal_ros.collection.marks.stops import without_aside
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.papers import readings as white
@@ -48,12 +49,34 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
         Settings of the cell; replaces `sigma_m`, `sigma_theta_rad` and `sense`.
     """
     truth = truth if linear is None else replace(truth, linear=linear)
-    if visits or settings or truth.by_visit or any(view.image for view in plan.views):
+    if visits or settings or differs_by_visit(truth) or any(view.image for view in plan.views):
         settings = settings or cell.CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
                                                  servo_sigma_theta_rad=0.0)
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
     return white.simulate_measurements(truth, plan, rng, sigma_m=sigma_m, sense=sense,
                                        sigma_theta_rad=sigma_theta_rad, missing=missing)
+
+
+def differs_by_visit(truth: Truth) -> bool:
+    """Return whether visits of a mark differ by more than noise."""
+    return bool(truth.placed) or any(np.any(values) for values in (
+        truth.microscope, truth.wiring - np.eye(2), truth.line_factor - 1, truth.distortion,
+        truth.backlash_m, truth.backlash_growth_m, truth.settling_m, truth.drift_m, truth.walk_m))
+
+
+def _of_cell(exposures: cell.GridExposures, artifact: Artifact,
+             sub_view: View) -> cell.GridExposures:
+    """Return the exposures as those of the marks in a cell, offsets from its place."""
+    if sub_view.cell is None:
+        return exposures
+    visits = exposures.visits
+    seen = next((one for one in exposures.others if one.cell == sub_view.cell), None) or cell.Seen(
+        (0, 0), exposures.offset, np.stack([visits.m, visits.n]), exposures.there)
+    m, n = seen.mark
+    site = np.stack(sub_view.on_stage(artifact).site_of(m, n)) * artifact.grid_pitch_m
+    place = np.array([[sub_view.cell_m.real], [sub_view.cell_m.imag]])
+    return replace(exposures, visits=replace(visits, m=m, n=n), offset=seen.offset - place,
+                   mark=seen.mark, there=seen.there, site=site, others=())
 
 
 def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
@@ -94,7 +117,7 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
     if view.grid:
         exposures = cell.grid_exposures(truth, index, view, settings=settings, rng=rng)
         lost = _lost(rng, missing, truth.artifact.shape)
-        parts = [_grid(part, truth, exposures.of_cell(truth.artifact, part.view),
+        parts = [_grid(part, truth, _of_cell(exposures, truth.artifact, part.view),
                        settings=settings, lost=lost, start_ns=start_ns) for part in parts]
     if view.angular and truth.artifact.angular_count:
         found = cell.angular_exposures(truth, index, view, settings=settings, rng=rng)
