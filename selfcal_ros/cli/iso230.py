@@ -54,9 +54,18 @@ def run(args: argparse.Namespace) -> int:
             problems.append(str(error))
             axes.append(iso230.axis_figures(stage, axis, args.line))
     radius = min(at.half) * at.grid_pitch_m if args.radius is None else args.radius * M_PER_MM
-    paths = [iso230.circle_figures(stage, radius), *iso230.diagonal_figures(stage)]
+    problems = [f"{line}; M alone is given" for line in problems]
+    paths = []
+    for figures, chosen in ((lambda: [iso230.circle_figures(stage, radius)], args.radius),
+                            (lambda: iso230.diagonal_figures(stage), None)):
+        try:
+            paths += figures()
+        except iso230.UnknownSitesError as error:
+            if chosen is not None:
+                raise
+            problems.append(f"{error}; left out")
     for line in problems:
-        print(f"selfcal iso230: {line}; M alone is given", file=sys.stderr)
+        print(f"selfcal iso230: {line}", file=sys.stderr)
     say(args, _text(stage, axes, paths), _json(stage, axes, paths))
     return exit_code(stage.result)
 
@@ -89,6 +98,7 @@ def _figures(found: AxisFigures | PathFigures) -> dict[str, Any]:
 def _json(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) -> dict[str, Any]:
     return plain({
         "axes": [{"axis": item.axis, "line": item.line_m, "positions": item.position_m,
+                  "left_out": item.left_out_m,
                   "up": item.up_m, "down": item.down_m, "s_up": item.s_up_m,
                   "s_down": item.s_down_m, "approaches": list(item.approaches),
                   "figures": _figures(item)} for item in axes],
@@ -103,9 +113,15 @@ def _text(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) ->
         up, down = item.approaches
         how = (f"{up} and {down} approaches from each side or more" if up else
                "mean deviation of the map, without repeats")
-        lines += [f"axis {item.axis} at {'yx'['xy'.index(item.axis)]} = "
-                  f"{item.line_m * MM_PER_M:g} mm, {len(item.position_m)} positions, {how}:",
-                  *_rows(item)]
+        place = item.position_m * MM_PER_M
+        lines.append(f"axis {item.axis} at {'yx'['xy'.index(item.axis)]} = "
+                     f"{item.line_m * MM_PER_M:g} mm, {len(place)} positions from {place[0]:g} to "
+                     f"{place[-1]:g} mm, {how}:")
+        if len(item.left_out_m):
+            why = "unknown, or too few approaches from a side" if up else "unknown"
+            lines.append("  left out: " + ", ".join(
+                f"{p * MM_PER_M:g}" for p in item.left_out_m) + f" mm ({why})")
+        lines += _rows(item)
     for path in paths:
         lines += [f"{path.name}:", *_rows(path)]
     lines.append("deviations: actual minus commanded, ISO 230-1; u: standard uncertainty (k=1)")

@@ -23,6 +23,10 @@ FEWEST = 3
 """Smallest number of positions along an axis."""
 
 
+class UnknownSitesError(InputError):
+    """Raised for a path in the field over sites that are not known."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scatter:
     """Repeats at one site, approached along one axis in both directions.
@@ -73,6 +77,8 @@ class AxisFigures:
         has the mean deviation in `up_m` and `down_m`, and NaN for the others.
     approaches : tuple of int
         Smallest number of approaches behind a standard deviation, positive and negative.
+    left_out_m : float array
+        Positions along the line that are not among these: unknown, or with too few repeats.
     figures : dict of Figure
         By the symbols of the standard: ``M``, and with repeats ``E``, ``B``, ``R``, ``A``
         and those of one direction, ``E+``, ``R-`` ...
@@ -86,6 +92,7 @@ class AxisFigures:
     s_up_m: np.ndarray
     s_down_m: np.ndarray
     approaches: tuple[int, int]
+    left_out_m: np.ndarray
     figures: dict[str, Figure]
 
 
@@ -211,12 +218,14 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     error = (emap.gx, emap.gy)[axis][place]
     drawn = error + _map_draws(stage, place, axis)
     position = np.array([site[axis] for site in known]) * at.grid_pitch_m
+    left_out = np.setdiff1d(np.arange(at.shape[axis]) - at.half[axis],
+                            [site[axis] for site in known]) * at.grid_pitch_m
     nothing = np.full(len(known), np.nan)
     if repeats is None:
         value = -error
         whole = float(np.ptp(value))
         return AxisFigures("xy"[axis], line * at.grid_pitch_m, position, value, value, nothing,
-                           nothing, (0, 0), {
+                           nothing, (0, 0), left_out, {
                                "M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
     items = [repeats[site] for site in known]
     s_up, s_down, reversal, u_reversal, dof_up, dof_down, sign = (
@@ -235,7 +244,7 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     found = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
         "xy"[axis], line * at.grid_pitch_m, position, up, down, s_up, s_down,
-        (int(dof_up.min()) + 1, int(dof_down.min()) + 1),
+        (int(dof_up.min()) + 1, int(dof_down.min()) + 1), left_out,
         {name: Figure(float(value), _rms_about(draws[name], float(value)))
          for name, value in found.items()})
 
@@ -306,7 +315,7 @@ def circle_figures(stage: StageMap, radius_m: float,
     Raises
     ------
     InputError
-        If the circle is not in the field.
+        If the circle is not in the field, or crosses unknown sites (UnknownSitesError).
     """
     at = stage.error_map.artifact
     reach = np.array(at.half) * at.grid_pitch_m - np.abs(centre_m)
@@ -325,7 +334,9 @@ def circle_figures(stage: StageMap, radius_m: float,
         return {"G": np.ptp(about, axis=-1), "Fmax": radial.max(axis=-1),
                 "Fmin": radial.min(axis=-1)}
 
-    return PathFigures(f"circle of radius {radius_m * 1e3:g} mm", _path(stage, (x, y), figures))
+    name = f"circle of radius {radius_m * 1e3:g} mm"
+    return PathFigures(name, _path(stage, (x, y), figures, (
+        name, "measure them, or choose a smaller --radius")))
 
 
 def diagonal_figures(stage: StageMap) -> list[PathFigures]:
@@ -351,7 +362,7 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
         return {"1 M": np.ptp(one, axis=-1), "1 length": lengths[0], "2 M": np.ptp(two, axis=-1),
                 "2 length": lengths[1], "3 length": lengths[0] - lengths[1]}
 
-    both = _path(stage, (x, y), figures)
+    both = _path(stage, (x, y), figures, ("diagonals", "measure them"))
     for key, name in (("1", "diagonal +x +y"), ("2", "diagonal +x -y"),
                       ("3", "difference of the diagonals")):
         found.append(PathFigures(name, {
@@ -361,11 +372,15 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
 
 
 def _path(stage: StageMap, at: tuple[np.ndarray, np.ndarray],
-          figures: Callable[[np.ndarray], dict[str, np.ndarray]]) -> dict[str, Figure]:
-    """Return the figures of the deviations, actual minus commanded, at points of a path."""
+          figures: Callable[[np.ndarray], dict[str, np.ndarray]],
+          said: tuple[str, str]) -> dict[str, Figure]:
+    """Return the figures of the deviations, actual minus commanded, at points of a path.
+
+    `said` are the name of the path, and what helps if it crosses unknown sites.
+    """
     gx, gy = stage.error(*at)
     if not np.isfinite(gx + gy).all():
-        raise InputError("path", "it crosses unknown sites", "measure them, or choose another path")
+        raise UnknownSitesError(said[0], "unknown sites on the path", said[1])
     deviation = -np.stack([gx, gy])
     found = figures(deviation)
     try:

@@ -204,8 +204,28 @@ def test_what_cannot_be_given_is_refused(call, message):
 
 def test_a_path_over_unknown_sites_is_refused():
     stage = StageMap(result_of(random_map(ARTIFACT, 1, unknown=((0, 0),))))
-    with pytest.raises(InputError, match="crosses unknown sites"):
+    with pytest.raises(InputError, match="diagonals: unknown sites on the path"):
         diagonal_figures(stage)
+
+
+def test_the_verb_leaves_out_what_crosses_unknown_sites_and_says_which(tmp_path, capsys):
+    path = str(tmp_path / "r.json")
+    write_json(path, plain(result_to_dict(result_of(random_map(
+        ARTIFACT, 1, unknown=((0, 0), (0, 3), (5, 3)))))))
+    assert main(["iso230", path]) == 0
+    out, err = capsys.readouterr()
+    assert "axis x at y = 0 mm, 5 positions from -20 to 30 mm" in out
+    assert "  left out: -30, 20 mm (unknown)" in out and out.count("left out") == 1
+    assert "circle" not in out and "diagonal" not in out
+    assert err.splitlines() == [
+        "selfcal iso230: circle of radius 30 mm: unknown sites on the path; measure them, or "
+        "choose a smaller --radius; left out",
+        "selfcal iso230: diagonals: unknown sites on the path; measure them; left out"]
+    assert main(["iso230", path, "--radius", "5", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [axis["left_out"] for axis in found["axes"]] == [[-0.03, 0.02], []]
+    assert [one["name"] for one in found["paths"]] == ["circle of radius 5 mm"]
+    assert main(["iso230", path, "--radius", "30"]) == 2
 
 
 def test_the_verb_takes_a_bag_or_a_result(tmp_path, capsys):
