@@ -22,7 +22,7 @@ from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
 from selfcal_ros.cli.trace import command, record, records_of
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
-from selfcal_ros.compensation.residual import Correction, Residual, combined
+from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
@@ -30,6 +30,7 @@ from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
 SCANNER_BITS = 16
+LEAST_BEND_M = 1e-9
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -193,6 +194,7 @@ def _export(args: argparse.Namespace) -> int:
                 "zero at home by the controller"]
     error_map, active = result.error_map, _active(args, frame)
     if active is not None:
+        say_bent(args, bends_between(error_map, frame, active))
         error_map = combined(error_map, frame, active)
         comments.append("replaces the table that was loaded during the calibration")
     texts = {args.output: cal_text([export.table_xy(error_map, frame)],
@@ -241,6 +243,14 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
             print(f"selfcal {args.verb}: {filled} unknown sites filled from their neighbours",
                   file=sys.stderr)
     return result, filled
+
+
+def say_bent(args: argparse.Namespace, bent_m: float) -> None:
+    """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
+    if bent_m >= LEAST_BEND_M:
+        print(f"selfcal {args.verb}: --onto: the active table bends between the nodes of the map "
+              f"by up to {bent_m / M_PER_UM:.3g} um, which the new table does not hold; calibrate "
+              "with nodes where that table has them, or without it", file=sys.stderr)
 
 
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":

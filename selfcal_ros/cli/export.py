@@ -4,7 +4,7 @@
 import argparse
 
 from selfcal_ros.aerotech.write import refuse_existing, write_cal
-from selfcal_ros.cli.cal import figures_of, ready, residual_text
+from selfcal_ros.cli.cal import figures_of, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.terminal import add_json, exit_code, say
 from selfcal_ros.cli.trace import command, record, records_of
@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
         active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
     made = export(args.format, result, wiring, args.output, active=active, filled=filled,
                   command=command(args))
+    say_bent(args, made.bent_m)
     check_outputs([args.result, *(args.onto or ())], [*made.files, *records_of(made.files)])
     refuse_existing(list(made.files), force=args.force)
     backups = {path: write_cal(path, text, force=args.force) for path, text in made.files.items()}

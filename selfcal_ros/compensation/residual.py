@@ -140,3 +140,19 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
     cx, cy = active(*frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy))
     return replace(error_map, gx=error_map.gx + frame.sign_x * cx * frame.unit_m,
                    gy=error_map.gy + frame.sign_y * cy * frame.unit_m)
+
+
+def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> float:
+    """Return how far an active table bends between the nodes of a map, m.
+
+    That is the largest difference to its linear interpolation, at every quarter of the cells. The
+    table that replaces it has the nodes of the map and loses this.
+    """
+    plate = error_map.artifact
+    x, y = (np.interp(np.arange(4 * len(p) - 3) / 4, np.arange(len(p)), p)
+            for p in (plate.x_m[:, 0], plate.y_m[0]))
+    left, right = (np.stack([np.interp(p, p[::4], unit) for unit in np.eye(len(p[::4]))], axis=1)
+                   for p in (x, y))
+    fields = active(*frame.to_machine(*np.meshgrid(x, y, indexing="ij")))
+    return frame.unit_m * max(
+        float(abs(c - left @ c[::4, ::4] @ right.T).max()) for c in fields)

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from selfcal_ros.compensation.export import provenance
-from selfcal_ros.compensation.residual import Correction, Residual, combined, plane_residuals
+from selfcal_ros.compensation.residual import (
+    Correction,
+    Residual,
+    bends_between,
+    combined,
+    plane_residuals,
+)
 from selfcal_ros.controllers.axes import (
     read_linuxcnc,
     read_siemens,
@@ -93,10 +99,14 @@ FORMATS = {
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """Files of a controller by name, and the residuals before and after they are loaded."""
+    """Files of a controller by name, and the residuals before and after they are loaded.
+
+    `bent_m` is how far the table that they replace bends between the nodes of the map.
+    """
 
     files: dict[str, str]
     residuals: list[Residual]
+    bent_m: float = 0.0
 
 
 def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
@@ -131,6 +141,7 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
     if wiring.integers and name != "beckhoff":
         raise InputError("--integers", f"{name} needs none", "leave it out")
     table = emap if active is None else combined(emap, frame, active)
+    bent = 0.0 if active is None else bends_between(emap, frame, active)
     texts = form.write(table, wiring)
     names = {part: _name(output, part) for part in texts}
     correct = form.read([Source("\n".join(lines) + "\n", names[part])
@@ -139,12 +150,14 @@ def export(name: str, result: CalibrationResult, wiring: Wiring, output: str, *,
     comments = [form.what, *provenance(result, frame, filled=filled, command=command), *form.notes,
                 *(IMPLIED if form.sign_is_implied else ()), _left(residuals[0])]
     if active is not None:
-        comments.append("replaces the table that was loaded during the calibration")
+        comments.append("replaces the table that was loaded during the calibration; what that "
+                        f"bends between the nodes of the map, up to {UM_PER_M * bent:.3g} um, is "
+                        "lost")
     head = [form.comment + "".join(c if c.isprintable() else " " for c in line)
             for line in comments]
     files = {names[part]: "\n".join([*lines, "", *head] if form.comments_last
                                     else [*head, *lines]) + "\n" for part, lines in texts.items()}
-    return Exported(files, residuals)
+    return Exported(files, residuals, bent)
 
 
 def _left(sites: Residual) -> str:

@@ -10,7 +10,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.compensation.residual import plane_residuals
 from selfcal_ros.controllers.export import FORMATS, export, loaded
-from selfcal_ros.controllers.grid import Source, Wiring, fixed
+from selfcal_ros.controllers.grid import Grid, Source, Wiring, fixed
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map, result_of
@@ -224,6 +224,24 @@ def test_a_table_replaces_the_one_that_was_active(name, frame):
     assert np.abs(off).max() < {"pmac": 3e-8, "linuxcnc": 2e-9, "siemens": 2e-9}.get(name, 1e-10)
     assert np.abs(made.residuals[0].after).max() < 3e-8 < 1e-7 < made.residuals[0].rms("before")
     assert "replaces the table" in next(iter(made.files.values()))
+
+
+@pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[5]])
+def test_what_an_active_table_bends_between_the_nodes_is_said(frame):
+    """Cells half as long in y, and 2 um in every second row: only nodes of the map can be true."""
+    emap, wiring = sayable("kmotion"), wiring_of(frame, "kmotion")
+    x, y = frame.to_machine(PLATE.x_m[:, 0], PLATE.y_m[0])
+    y = np.linspace(y[0], y[-1], 2 * len(y) - 1)
+    bump = np.where(np.arange(len(y)) % 2, 2e-6 / frame.unit_m, 0.0)
+    active = Grid((x[0], y[0]), (x[1] - x[0], y[1] - y[0]), np.tile(bump, (len(x), 1)), "hold")
+    for also, bent in ((0.0, 2e-6), (5e-6, 2e-6)):  # a slope is no bend
+        made = export("kmotion", result_of(emap), wiring, "out.txt", active=lambda px, py, s=also: (
+            active.at(px, py) + s * px, 0 * px))
+        assert made.bent_m == pytest.approx(bent, rel=1e-6)
+        assert made.residuals[0].largest("after") < rounding("kmotion", frame) * 2
+        assert "bends between the nodes of the map, up to 2 um, is lost" in made.files["out.txt"]
+    assert export("kmotion", result_of(emap), wiring, "o", active=export_of(
+        "kmotion", emap, wiring)).bent_m < 1e-10
 
 
 def export_of(name, emap, wiring):
