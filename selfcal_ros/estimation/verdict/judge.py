@@ -27,7 +27,12 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations, free_inverse
 from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
-from selfcal_ros.estimation.verdict.search import ALWAYS_SITES, is_searched, search_causes
+from selfcal_ros.estimation.verdict.search import (
+    ALWAYS_SITES,
+    SearchResult,
+    is_searched,
+    search_causes,
+)
 from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     enlarged,
@@ -73,7 +78,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
     failed = [*_rotation_findings(solved, checked), *_axes_findings(checked),
               *([] if solved.converged else [Finding("not_converged")]),
               *_sign_findings(checked, measurements, options)]
-    searched = search_causes(checked, measurements, options, failed=bool(noises))
+    searched = _with_declared(search_causes(checked, measurements, options, failed=bool(noises)),
+                              options)
     own = checked is solved
     if own:
         solved = searched.solved
@@ -100,6 +106,14 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
         provenance=provenance_of(measurements, options))
     return replace(result, budget=tuple(budget_lines(result)),
                    excluded=_excluded(solved, result, options))
+
+
+def _with_declared(searched: SearchResult, options: Options) -> SearchResult:
+    """Return what was found, with a note on causes that are declared to be exactly zero."""
+    zero = {str(term.name) for term in options.terms if term.size == 0}
+    return replace(searched, causes=tuple(
+        replace(cause, details={**(cause.details or {}), "declared": 0.0})
+        if str(cause.name) in zero else cause for cause in searched.causes))
 
 
 def _excluded(solved: Solved, result: CalibrationResult,

@@ -321,7 +321,8 @@ def what_it_is(cause: Cause) -> str:
             return cause.text
         if "given" in cause.details:
             return _larger_term(cause, cause.details["given"])
-        return _CAUSES[cause.name](cause, cause.details)
+        declared = ", declared to be exactly zero" * ("declared" in cause.details)
+        return _CAUSES[cause.name](cause, cause.details) + declared
     except (KeyError, TypeError, ValueError):
         if not cause.text:
             raise

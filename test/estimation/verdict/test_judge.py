@@ -17,6 +17,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.truth import hu_plan, simulate_measurements
@@ -108,3 +109,16 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(stop_sigma_m,
     verdict = calibrate(offsets_of(stop_sigma_m), Options(**how)).verdict
     assert verdict.failed == (() if shown else (Finding("sign_not_shown"),))
     assert verdict.grade is (Grade.GOOD if shown else Grade.NOT_QUALIFIED)
+
+
+@pytest.mark.parametrize(("given", "is_declared"), [("plate_shape:0", True),
+                                                    ("plate_scale:0", False)])
+def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(given, is_declared):
+    rng, plan = np.random.default_rng(5), hu_plan(Artifact(7, 0.01), repeats=2)
+    bent = replace(random_truth(plan.artifact, len(plan.views), rng),
+                   plate_shape_m=rng.normal(0, 2e-7, (len(plan.views), 2, 3)))
+    result = worded(calibrate(simulate_measurements(bent, plan, rng, sigma_m=5e-9), Options(
+        terms=parse_terms([given], ""))))
+    [cause] = result.verdict.causes
+    assert cause.name == "plate_shape" and ("declared" in cause.details) is is_declared
+    assert ("declared to be exactly zero" in result.verdict.sentence) is is_declared
