@@ -203,8 +203,8 @@ def run(args: argparse.Namespace) -> int:
             result = worded(unidentified_result(measurements, error.observability))
             _write(args, result_to_dict(with_input(result, bag_input(args.bag), lost)))
         if findings:  # missing readings look like a deficient plan
-            raise NotIdentifiableError(f"{args.bag}: {findings[0]}; correct this first (as it is: "
-                                       f"{error})", error.observability) from error
+            raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
+                                       error.observability) from error
         raise
     with busy("validating"):
         result, lines = _validated(args, measurements, options, result)
