@@ -249,12 +249,12 @@ def test_the_verb_takes_a_bag_or_a_result(tmp_path, capsys):
 
 
 def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monkeypatch):
-    from selfcal_ros.bagio import offline
+    from selfcal_ros.cli import iso230 as verb
 
     _, readings = measured(order="raster", sigma=1e-8)
     result = worded(calibrate(readings, Options(causes=False)))
     write_json(tmp_path / "r.json", plain(result_to_dict(result)))
-    monkeypatch.setattr(offline, "collect_bag", lambda *_: (readings, {}, [], []))
+    monkeypatch.setattr(verb, "collect_bag", lambda *_: (readings, {}, [], []))
     assert main(["iso230", "some_bag", "--result", str(tmp_path / "r.json")]) in (0, 5)
     both = capsys.readouterr()
     assert "visit_order" in both.err and "M alone is given" in both.err
