@@ -11,8 +11,8 @@ towards 0, noise of the offset the slope of the position: the scale is between t
 Of 2,000 clean simulated measurements none was refused (test_wiring.py).
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from math import exp, lgamma, log, pi
@@ -30,6 +30,10 @@ SHOWN = 0.01
 """Probability without motion below which the sign of the offsets counts as confirmed."""
 DOUBLED, HALVED = 1.5, 0.7
 """Scales beyond which an offset is in wrong units; nearer to 1 the scale is fitted."""
+BEYOND = 3.0
+"""Standard uncertainties of the microscope's scale beyond which repeats contradict it."""
+SCALE_LEVEL = 1e-3
+"""Probability, over both axes and both limits, of contradicting a correct scale."""
 LEAST_SLOPE = 0.3
 """Scale below which an offset is taken not to follow the stage."""
 LEAST_MOTION = 1e-12
@@ -122,14 +126,35 @@ def sign_is_shown(measurements: Measurements) -> bool:
     """
     if any(view.view.cell is not None and len(view.m) for view in measurements.views):
         return True
+    motion = _of_all_views(measurements)
+    return motion is not None and _p_for(motion, np.eye(2), -np.eye(2)) < SHOWN
+
+
+def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResponse | None:
+    """Return the response that most contradicts a microscope's scale of 1 ± u_scale; None if none.
+
+    From all views together. The scale is between the slope and `OffsetResponse.most`, so noise of
+    encoder and detection, however large, does not contradict a correct one.
+    """
+    motion = _of_all_views(measurements)
+    if motion is None:
+        return None
+    limits = max(1 - BEYOND * u_scale, 0.0), 1 + BEYOND * u_scale
+    each = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
+    axis, p = int(np.argmin(each)), min(*each, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
+    return replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p) if (
+        6 * p < SCALE_LEVEL) else None
+
+
+def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
+    """Return the sums of grid marks over all views; None without motion along both axes."""
     motions = [view.motion for view in measurements.views if view.motion is not None]
     if not motions:
-        return False
+        return None
     motion = RepeatMotion(np.sum([one.products for one in motions], axis=0),
                           sum(one.dof for one in motions))
     moved = np.diag(motion.products) > LEAST_MOTION**2 * motion.dof
-    return motion.dof > 1 and bool(moved.all()) and (
-        _p_for(motion, np.eye(2), -np.eye(2)) < SHOWN)
+    return motion if motion.dof > 1 and bool(moved.all()) else None
 
 
 def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
@@ -152,6 +177,7 @@ def _wirings(n: int) -> tuple[np.ndarray, ...]:
 def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
            ) -> tuple[OffsetResponse, ...]:
     """Return the offsets that follow the stage wrongly; none if in doubt."""
+    limits = HALVED, DOUBLED
     n, least = len(axes), LEAST_MOTION**2 * motion.dof
     moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
     if not moved[:n].any() or not moved[n:].any():
@@ -164,7 +190,7 @@ def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
         response = _response(motion, (i, j), axes)
         if response.p >= TOLD or response.most < LEAST_SLOPE:
             continue
-        if response.crossed or wiring[j, i] < 0 or _p_of_scale(motion, (i, j)) < level:
+        if response.crossed or wiring[j, i] < 0 or _p_of_scale(motion, [(i, j)], limits) < level:
             out.append(response)
     return tuple(out)
 
@@ -203,19 +229,23 @@ def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float
     return _p_of(float(found / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
 
 
-def _p_of_scale(motion: RepeatMotion, at: tuple[int, int]) -> float:
-    """Return the probability of a scale as far from 1 if it is within `HALVED` to `DOUBLED`.
+def _p_of_scale(motion: RepeatMotion, pairs: Sequence[tuple[int, int]],
+                limits: tuple[float, float]) -> float:
+    """Return the probability of a scale as far from 1 if it is within the `limits`.
 
-    With o the offset and p the position: o - s p correlates with p if even the smallest scale is
-    beyond s, p - o / s with o if even the largest is below it.
+    Offset j of each pair (i, j) follows axis i, all with the same scale. With o the offset and p
+    the position: o - s p correlates with p if even the smallest scale is beyond s, s p - o with o
+    if even the largest is below it.
     """
-    (i, j), n = at, len(motion.products) // 2
-    place, offset = np.eye(2 * n)[i], np.eye(2 * n)[n + j]
-    if motion.products[i, n + j] < 0:
-        offset = -offset
-    large = _correlation(motion.products, place, offset - DOUBLED * place)
-    small = _correlation(motion.products, offset, place - offset / HALVED)
-    return min(_p_of(large, motion.dof), _p_of(small, motion.dof))
+    n, (least, most) = len(motion.products) // 2, limits
+    both = np.zeros((2, 2))
+    for i, j in pairs:
+        one = motion.products[np.ix_([i, n + j], [i, n + j])]
+        both += np.where(np.eye(2, dtype=bool), one, abs(one))
+    place, offset = np.eye(2)
+    dof = len(pairs) * (motion.dof - 1) + 1
+    return min(_p_of(_correlation(both, place, offset - most * place), dof),
+               _p_of(_correlation(both, offset, least * place - offset), dof))
 
 
 def _correlation(products: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:

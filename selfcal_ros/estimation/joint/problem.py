@@ -20,6 +20,10 @@ from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 
+LEAST_DOF = 0.5
+"""Degrees of freedom of residuals below which they are rounding: terms with sizes leave fractions
+of one, however small."""
+
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
@@ -113,6 +117,8 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
     floor : float
         Noise at the level of rounding, which is not tested.
     """
+    if residuals[1] < LEAST_DOF:
+        residuals = (float("nan"), 0.0)
     identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
     base = (declared, float("inf")) if np.isfinite(declared) else (
         (float("nan"), 0.0) if identical else repeats)

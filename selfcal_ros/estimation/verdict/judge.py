@@ -8,6 +8,7 @@ enlarges U; one that is not disqualifies the result. The result also states when
 taken.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.checks.wiring import sign_is_shown
+from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.joint.finer import is_too_large
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
@@ -43,7 +44,7 @@ from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, VISIT_TERMS, ModelTerm, TermName
-from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, Provenance, Verdict
+from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
 MUCH_MORE = 1.1
@@ -56,6 +57,10 @@ show the sign of the offsets."""
 
 HIDDEN = 1e-3
 """Share of the scale in an unobservable combination above which the scale is unknown."""
+
+FITTED = 0.5
+"""Ratio of the fitted to the assumed standard uncertainty of the microscope's scale below which
+the readings have determined it."""
 
 UNEXPLAINED = 1.5
 """Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which
@@ -80,6 +85,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
               *_sign_findings(checked, measurements, options)]
     searched = _with_declared(search_causes(checked, measurements, options, failed=bool(noises)),
                               options)
+    failed += _scale_findings(searched.solved if checked is solved else checked, measurements,
+                              options, searched.causes)
     own = checked is solved
     if own:
         solved = searched.solved
@@ -187,6 +194,27 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
     variance = free_inverse(equations)[scale[0], scale[0]] * model.found.xy.sigma**2
     return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
+
+
+def _scale_findings(solved: Solved, measurements: Measurements, options: Options,
+                    causes: Iterable[Cause]) -> list[Finding]:
+    """Return a finding if repeats contradict a scale of the microscope that is not fitted.
+
+    A fit uses offsets that are far larger than their noise. Of smaller ones, the noise of encoders
+    reduces the scale and that of detections increases it: they give limits.
+    """
+    term = next((term for term in options.model_terms(visits=True)
+                 if term.name is TermName.MICROSCOPE), None)
+    u = 0.0 if term is None else term.size_of("scale")
+    fitted = [estimate for each in solved.result.model.terms
+              if each.name == TermName.MICROSCOPE for estimate in each.estimates
+              if estimate.component == "scale" and estimate.u < FITTED * u]
+    if np.isinf(u) or fitted or any(cause.name == TermName.MICROSCOPE for cause in causes):
+        return []
+    found = contradicted_scale(measurements, u)
+    return [] if found is None else [Finding(
+        "scale_of_offsets", -found.slope, found.u_slope, unit="m/m", p=found.p, axis=found.axis,
+        details={"most": found.most, "u_scale": u})]
 
 
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:

@@ -167,6 +167,10 @@ SENTENCES: dict[str, Words] = {
         "nothing in the readings shows the sign of the microscope's offsets, and with the opposite "
         "sign the map would be that of a different stage: have the stage stop next to the marks "
         "deliberately (check_stops in the plan), or declare the microscope (--microscope 0.01)"),
+    "scale_of_offsets": lambda f, of: (
+        f"offsets along {f.axis} are {f.size:.3f} ± {f.u:.3f} to {of['most']:.3f} times what the "
+        f"stage moves among repeats, but the scale is taken as 1 ± {of['u_scale']:.3g}: correct "
+        "the pixel size, or add check stops, which determine the scale"),
     "not_converged": lambda f, of: (
         "the estimate converged only without the assumptions about the measurement, which the "
         "readings are far from: check the sense, the axes and the pixel size of the microscope"),

@@ -15,6 +15,7 @@ from selfcal_ros.estimation.checks.wiring import (
     WiringError,
     _p_of,
     check_wiring,
+    contradicted_scale,
     wiring_faults,
     worded,
 )
@@ -86,6 +87,33 @@ def test_units_far_from_one_are_refused_and_others_left_to_the_fit(scale, named)
     told = found(motion(np.random.default_rng(2), wiring=np.diag(scale), servo=100 * NM))
     assert "".join(told) == named
     assert all(told[axis][1] == pytest.approx(-scale["xy".index(axis)], abs=0.1) for axis in told)
+
+
+@pytest.mark.parametrize(("scale", "how", "wanted"), [
+    ((1.3, 1.3), {}, 1.3), ((0.8, 0.8), {}, 0.8), ((1.0, 1.3), {}, 1.3), ((1.1, 1.1), {}, 1.1),
+    ((1.02, 1.02), {}, None), ((1.3, 1.3), {"servo": 20 * NM, "noise": 20 * NM}, 1.3),
+    ((0.8, 0.8), {"servo": 20 * NM, "readout": 10 * NM}, None)])
+def test_repeats_contradict_a_scale_that_no_noise_explains(scale, how, wanted):
+    """Encoder noise makes a scale smaller, noise of detections larger than the offsets show."""
+    told = measured(*(motion(np.random.default_rng(seed), wiring=np.diag(scale), **how)
+                      for seed in range(4)))
+    response = contradicted_scale(told, 0.01)
+    assert (response is None) == (wanted is None)
+    if response is not None:
+        assert response.axis == ("y" if scale[0] == 1 else response.offset)
+        assert -response.slope == pytest.approx(wanted, rel=0.08)
+        assert -response.slope < response.most
+        assert contradicted_scale(told, 0.2) is None
+        assert contradicted_scale(measured(motion(np.random.default_rng(0), servo=0.0)), 0) is None
+
+
+@pytest.mark.parametrize("how", [{}, {"readout": 60 * NM}, {"noise": 60 * NM}, {"drift": UM},
+                                 {"noise": 30 * NM, "readout": 30 * NM}])
+def test_no_noise_contradicts_a_correct_scale(how):
+    """Of 200 measurements with a scale known exactly."""
+    told = [measured(motion(np.random.default_rng(seed), servo=30 * NM, repeats=2, **how))
+            for seed in range(200)]
+    assert sum(contradicted_scale(one, 0.0) is not None for one in told) <= 1
 
 
 def test_readout_noise_is_no_scale_and_turns_no_sign():

@@ -30,6 +30,16 @@ def test_the_larger_of_two_noises_that_contradict_each_other_counts(ratio, large
     assert found.dof == {"residuals": 50, "repeats": 100}[larger]
 
 
+@pytest.mark.parametrize(("dof", "counts"), [
+    (1e-13, False), (0.49, False), (0.51, True), (2, True)])
+def test_residuals_without_degrees_of_freedom_contradict_nothing(dof, counts):
+    """Terms with sizes leave a fraction of one, in which there is rounding alone."""
+    found = noise_estimate((8e-7, 48), (2e-12, dof), NAN)
+    assert (found.dof_residuals, found.sigma, found.dof) == (dof * counts, 8e-7, 48)
+    assert np.isnan(found.p) is not counts and np.isnan(found.residuals) is not counts
+    assert counts or not found.contradicted
+
+
 @pytest.mark.parametrize(("dof", "used"), [(29, "residuals"), (30, "repeats")])
 def test_repeats_count_from_thirty_degrees_of_freedom(dof, used):
     found = noise_estimate((1e-8, dof), (1.01e-8, 200), NAN)

@@ -122,3 +122,21 @@ def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(given, is
     [cause] = result.verdict.causes
     assert cause.name == "plate_shape" and ("declared" in cause.details) is is_declared
     assert ("declared to be exactly zero" in result.verdict.sentence) is is_declared
+
+
+@pytest.mark.parametrize(("pixels", "how", "wanted"), [
+    (1.0, {}, False), (1.3, {}, True), (0.77, {}, True),
+    (1.3, {"terms": parse_terms(["microscope:0.3:0.01:0.002"], "")}, False)])
+def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(pixels, how, wanted):
+    """Stops that scatter by five times the noise are too small for the fit."""
+    plan, rng = hu_plan(Artifact(7, 0.01, 0), 4), np.random.default_rng(5)
+    settings = CellSettings(sigma_xy_m=20e-9, servo_sigma_m=100e-9)
+    spread = Spread(rotation="finite", phi_rad=1e-4, microscope_pixels=pixels)
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
+                                     settings=settings, visits=True)
+    verdict = calibrate(readings, Options(**how)).verdict
+    assert [f.name for f in verdict.failed] == ["scale_of_offsets"] * wanted
+    if wanted:
+        (found,) = verdict.failed
+        assert found.size == pytest.approx(pixels, abs=0.08) and found.unit == "m/m"
+        assert verdict.grade is Grade.NOT_QUALIFIED
