@@ -3,7 +3,6 @@
 
 import argparse
 import json
-import math
 import os
 import sys
 from dataclasses import replace
@@ -27,7 +26,7 @@ from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.results import read_result
-from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
+from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC, is_celsius
 
 SCANNER_BITS = 16
 LEAST_BEND_M = 1e-9
@@ -137,8 +136,9 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> "MachineSetup":
-    if args.temperature is not None and not math.isfinite(args.temperature):
-        raise InputError("--temperature", f"{args.temperature} is not a temperature", "give degC")
+    if args.temperature is not None and not is_celsius(args.temperature):
+        raise InputError("--temperature", f"{args.temperature} is no temperature from -50 to 100 "
+                         "degC: is it in K?", "give degC")
     directions = cal_lines.pairs(args.home_direction, "--home-direction")
     for axis, word in directions.items():
         if word not in ("CW", "CCW"):

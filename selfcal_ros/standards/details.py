@@ -7,6 +7,7 @@ from datetime import date
 from typing import Any
 
 from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.units import is_celsius
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 """Places of a calibration that the schema knows."""
@@ -112,6 +113,9 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
                 item.get("u", 1.0) <= 0):
             raise InputError(f"{where}: conditions[{index}]", "neither a value with its unit nor a "
                              "text", "give value, u and unit, or text")
+        if item.get("unit") == "degC" and not is_celsius(item["value"]):
+            raise InputError(f"{where}: conditions[{index}]", f"{item['value']:g} is no "
+                             "temperature from -50 to 100 degC: is it in K?", "give degC")
     core = found["certificate"]
     if core["begin"] > core["end"]:
         raise InputError(f"{where}: certificate.end", f"{core['end']} is before {core['begin']}",

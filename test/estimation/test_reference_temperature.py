@@ -34,6 +34,12 @@ def test_what_is_no_set_of_temperatures_is_refused(text):
         ReferenceLength("artifact", 0.0).at_temperature(text)
 
 
+@pytest.mark.parametrize("text", ["296:0.02:8e-6:0", "20:0.02:8e-6:0:293.15", "-51:0:0:0"])
+def test_a_temperature_in_kelvin_is_refused(text):
+    with pytest.raises(InputError, match=r"-50 to 100 degC: is it in K\?"):
+        ReferenceLength("artifact", 0.0).at_temperature(text)
+
+
 def test_the_solver_moves_its_reference():
     settings = SolverSettings(reference_kind="artifact", reference_error=1e-6, reference_u=1e-7,
                               reference_at="21:0.05:5e-7:0")
