@@ -227,8 +227,7 @@ def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndar
                 rules: Rules) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return the marks of detections with the stage at `position` (2, n), and their cells (n,).
 
-    A plate may lie half a pitch of the image or more off its place, in a view whose images show
-    it: the marks are displaced in the image, and without ids they lie beside the plate.
+    Marks of a displaced plate are displaced in the image, and lie beside it without ids.
     """
     found, number = _identified_at(artifact, view, d, position, rules)
     if view.image is None or not np.isin(found.reasons, DISPLACED).any():
@@ -242,7 +241,8 @@ def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndar
         artifact, view, found.rigid, _reading(rules.sense, position, offset))
     tried = _identified_at(artifact, view, d, position, rules, plate=plate,
                            shift=stops.shift_of(view, offset, away))
-    return tried if plate or _found(tried[0]) > _found(found) else (found, number)
+    scaled = _identified_at(artifact, view, d, position, rules, of_cell=True)
+    return tried if plate else max((found, number), scaled, tried, key=lambda one: _found(one[0]))
 
 
 DISPLACED = (Reason.OUTSIDE_IMAGE, Reason.NOT_AT_MARK, Reason.SEVERAL, Reason.TOO_FAR,
@@ -266,13 +266,14 @@ def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.nda
 
 
 def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray,
-                   rules: Rules, *, shift: complex = 0j, plate: complex = 0j,
+                   rules: Rules, *, shift: complex = 0j, plate: complex = 0j, of_cell: bool = False,
                    ) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
     offset = np.stack([d["ox"], d["oy"]])
     number = stops.numbers_of(view, stops.cells_of(view, offset, shift))
     beside = stops.places_of_cells(view, offset, shift)
-    away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m
+    away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m + (
+        stops.middles(view, number, offset - beside) if of_cell else 0.0)
     found = identify.identify_grid(
         artifact, view, _reading(rules.sense, position, offset) - away,
         ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,

@@ -101,6 +101,16 @@ def test_the_map_of_a_displaced_plate_is_that_of_the_one_in_place(ids):
         np.testing.assert_allclose(*(getattr(found, f"g{axis}") for found in maps), atol=2e-10)
 
 
+@pytest.mark.parametrize("pixels", [0.75, 1.2])
+def test_a_camera_of_another_scale_loses_no_cell(pixels):
+    shot = scene(PLAN, **QUIET)
+    moved = [replace(d, offset_x=pixels * d.offset_x, offset_y=pixels * d.offset_y)
+             for d in shot.detections]
+    measurements, _ = collect([*shot.commands, *shot.samples, *moved])
+    assert not measurements.all_rejected()
+    assert all(len(view.m) for view in measurements.views if view.view.grid)
+
+
 def test_of_a_part_of_the_image_ids_tell_the_cells():
     """Only the two left columns of each image are visible: they could be the two right ones."""
     _, told, progress = displaced(PLAN, (0.6e-3, 0.0), ids=True,

@@ -103,6 +103,26 @@ def numbers_of(view: View, cells: np.ndarray) -> np.ndarray:
     return np.where(shown, (x + hx) * (2 * hy + 1) + y + hy, -1)
 
 
+def middles(view: View, number: np.ndarray, away_m: np.ndarray) -> np.ndarray:
+    """Return the median displacement in the cell of each mark, less that on the axis, m.
+
+    Parameters
+    ----------
+    view : View
+        A view with images.
+    number : int array (n,)
+        Cells, see `numbers_of`; beyond the image the displacement is 0.
+    away_m : float array (2, n)
+        Of marks from the places of their cells; without any on the axis all displacements are 0.
+    """
+    axis = numbers_of(view, np.zeros(1, dtype=complex))[0]
+    out, cells = np.zeros_like(away_m), np.unique(number[number >= 0])
+    for cell in cells if axis in cells else ():
+        out[:, number == cell] = np.median(away_m[:, number == cell], axis=1, keepdims=True)
+    return out - np.where(number >= 0, np.median(
+        away_m[:, number == axis], axis=1, keepdims=True), 0) if out.any() else out
+
+
 @lru_cache(64)
 def marks_shown(artifact: Artifact, view: View) -> tuple[np.ndarray, ...]:
     """Return the marks that each cell shows if the stage stops at every mark in the field.
