@@ -54,6 +54,8 @@ def test_no_reason_is_cut(folder, monkeypatch, capsys):
     assert reason.endswith(" times the size assumed")
     what = reason.removeprefix("the readings show ")
     (remedy,) = (each["action"] for each in cause["remedies"] if "action" in each)
+    (model,) = (each["model"] for each in cause["remedies"] if "model" in each)
+    remedy = f"solve with --model {model}, or {remedy}"
     assert cause["text"] == f"{what}: {remedy}"
     assert sentence == f"Good within an enlarged U: {cause['text']}"
     assert main(["report", "r.json", "-o", "r.html"]) == 0

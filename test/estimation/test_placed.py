@@ -12,10 +12,13 @@ from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.roughness import adequacy_of, known_places
 from selfcal_ros.model.artifact import Interpolation, MapGrid, with_nodes
+from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.placed import SIX, THREE, dense, error_in_datum, plate, readings
+from test.support.truth import simulate_measurements
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
@@ -166,6 +169,21 @@ def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
         error = error_in_datum(result.error_map, truth)
         inside.append(np.mean(np.abs(error) < result.noise.k_xy * u))
     assert np.mean(inside) > 0.93
+
+
+def test_terms_do_not_size_the_lack_of_fit_of_a_map_that_suffices():
+    """A finer map hardly determines the microscope beside it: 5 µm followed from its value."""
+    plan = plan_from_dict({
+        "plan_id": "p", "artifact": {"grid_size": 9, "grid_pitch": 0.008, "angular_count": 0},
+        "map": {"grid_size": 7, "interpolation": "bicubic"}, "views": [
+            {"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
+            {"name": "c", "rotation_deg": 37, "translation_mm": [6, -4], "repeats": 2}]}, "")
+    spread = Spread(rotation="finite", correlation_pitches=4.0)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        truth = random_truth(plan.artifact, 3, rng, spread)
+        result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=10e-9, visits=True))
+        assert 5e-9 < np.nanmean(result.error_map.u_gx) < 10e-9
 
 
 def test_a_map_that_was_tried_is_the_remedy():

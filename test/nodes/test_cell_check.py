@@ -17,7 +17,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from rosgraph_msgs.msg import Clock
 
-from selfcal_ros.cli import processes
+from selfcal_ros.cli import cell
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Phase
@@ -225,7 +225,7 @@ def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
     @contextmanager
     def child(*_, **__):
         yield SimpleNamespace(stdout=[json.dumps(item)], wait=lambda: code)
-    monkeypatch.setattr(processes, "process", child)
+    monkeypatch.setattr(cell, "process", child)
     assert main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words]) == code
     found = capfd.readouterr().out
     assert (json.loads(found) if words else found) == said

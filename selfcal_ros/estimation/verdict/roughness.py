@@ -123,7 +123,8 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if dof >= 1 and more >= 1:
         p = _improved(before, rest, more, dof)
         if p < 1.0:
-            power = _Further.of(fine, coarse, other.y).power(
+            y = other.y if p < ADEQUACY_LEVEL else model.y  # the terms of a map that suffices
+            power = _Further.of(fine, coarse, y).power(
                 max(float(np.sqrt(rest / dof)), NOISE_FREE_M))
         power = power + _of_terms(model, other) ** 2 * (p < ADEQUACY_LEVEL)
     if grid.views.spline.axes[0].degree == 1 and before > readings * NOISE_FREE_M**2:
