@@ -151,17 +151,20 @@ def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
     motions = [view.motion for view in measurements.views if view.motion is not None]
     if not motions:
         return None
-    motion = RepeatMotion(np.sum([one.products for one in motions], axis=0),
-                          sum(one.dof for one in motions))
+    motion = _sum(motions)
     moved = np.diag(motion.products) > LEAST_MOTION**2 * motion.dof
     return motion if motion.dof > 1 and bool(moved.all()) else None
+
+
+def _sum(motions: Sequence[RepeatMotion]) -> RepeatMotion:
+    return RepeatMotion(np.sum([one.products for one in motions], axis=0),
+                        sum(one.dof for one in motions))
 
 
 def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
     """Yield the sums of all views, then those of each view with its name."""
     if told:
-        yield "", RepeatMotion(np.sum([motion.products for _, motion in told], axis=0),
-                               sum(motion.dof for _, motion in told))
+        yield "", _sum([motion for _, motion in told])
     if len(told) > 1:
         yield from told
 

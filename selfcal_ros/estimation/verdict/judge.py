@@ -85,12 +85,11 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
               *_sign_findings(checked, measurements, options)]
     searched = _with_declared(search_causes(checked, measurements, options, failed=bool(noises)),
                               options)
-    failed += _scale_findings(searched.solved if checked is solved else checked, measurements,
-                              options, searched.causes)
     own = checked is solved
     if own:
         solved = searched.solved
         noises = _noise_findings(solved)
+    failed += _scale_findings(solved if own else checked, measurements, options, searched.causes)
     reference = options.reference
     result = replace(solved.result, reference=None if reference is None else {
         "kind": str(reference.kind), "relative_error": reference.relative_error,

@@ -134,9 +134,12 @@ def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(pixel
     spread = Spread(rotation="finite", phi_rad=1e-4, microscope_pixels=pixels)
     readings = simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
                                      settings=settings, visits=True)
-    verdict = calibrate(readings, Options(**how)).verdict
+    verdict = worded(calibrate(readings, Options(**how))).verdict
     assert [f.name for f in verdict.failed] == ["scale_of_offsets"] * wanted
     if wanted:
         (found,) = verdict.failed
         assert found.size == pytest.approx(pixels, abs=0.08) and found.unit == "m/m"
+        assert (found.size > 1) == (pixels > 1) and found.size < found.details["most"]
+        assert f"{found.size:.3f} ± {found.u:.3f} to" in verdict.sentence
+        assert "the scale is taken as 1 ± 0.01: correct the pixel size" in verdict.sentence
         assert verdict.grade is Grade.NOT_QUALIFIED
