@@ -26,8 +26,3 @@ RAD_PER = {"rad": 1.0, "mrad": RAD_PER_MRAD, "urad": RAD_PER_URAD, "deg": math.r
 
 M_PER = {"m": 1.0, "mm": M_PER_MM, "um": M_PER_UM, "nm": M_PER_NM}
 """Length of each unit by its name in options and files."""
-
-
-def is_celsius(value: float) -> bool:
-    """Whether a temperature of a machine can be meant, -50 to 100 degC: not one in kelvin."""
-    return -50.0 <= value <= 100.0

@@ -22,11 +22,11 @@ from selfcal_ros.cli.trace import command, record, records_of
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
-from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.results import read_result
-from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC, is_celsius
+from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
 SCANNER_BITS = 16
 LEAST_BEND_M = 1e-9
@@ -136,9 +136,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _setup(args: argparse.Namespace) -> "MachineSetup":
-    if args.temperature is not None and not is_celsius(args.temperature):
-        raise InputError("--temperature", f"{args.temperature} is no temperature from -50 to 100 "
-                         "degC: is it in K?", "give degC")
+    if args.temperature is not None:
+        check_celsius(args.temperature, "--temperature")
     directions = cal_lines.pairs(args.home_direction, "--home-direction")
     for axis, word in directions.items():
         if word not in ("CW", "CCW"):

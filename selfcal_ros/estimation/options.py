@@ -7,12 +7,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.errors import InputError, check_celsius, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
-from selfcal_ros.units import is_celsius
 
 PRIORS = ("gp",)
 """Priors of the map of the stage."""
@@ -160,9 +159,7 @@ class ReferenceLength:
             raise InputError("reference length", f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
                              "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)")
         for name in ("temperature_c", "certified_at_c"):
-            if not is_celsius(known[name]):
-                raise InputError("reference length", f"{known[name]:g} in '{text}' is no "
-                                 "temperature from -50 to 100 degC: is it in K?", "give degC")
+            check_celsius(known[name], "reference length", f" in '{text}'")
         warmer = known["temperature_c"] - known["certified_at_c"]
         sign = 1 if self.kind.of_plate else -1  # a longer scale indicates less
         return replace(

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from datetime import date
 from typing import Any
 
-from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.units import is_celsius
+from selfcal_ros.errors import InputError, check_celsius, known_are
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 """Places of a calibration that the schema knows."""
@@ -113,9 +112,8 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
                 item.get("u", 1.0) <= 0):
             raise InputError(f"{where}: conditions[{index}]", "neither a value with its unit nor a "
                              "text", "give value, u and unit, or text")
-        if item.get("unit") == "degC" and not is_celsius(item["value"]):
-            raise InputError(f"{where}: conditions[{index}]", f"{item['value']:g} is no "
-                             "temperature from -50 to 100 degC: is it in K?", "give degC")
+        if item.get("unit") == "degC":
+            check_celsius(item["value"], f"{where}: conditions[{index}]")
     core = found["certificate"]
     if core["begin"] > core["end"]:
         raise InputError(f"{where}: certificate.end", f"{core['end']} is before {core['begin']}",
