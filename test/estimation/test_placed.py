@@ -105,6 +105,20 @@ def test_nodes_that_no_reading_tells_are_unknown():
     assert np.nanmax(np.abs(error_in_datum(emap, truth))) < 1e-11
 
 
+@pytest.mark.parametrize(("turn", "nodes", "count"), [(5, 9, 45), (5, 7, 27), (37, 9, 81)])
+def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(turn, nodes, count):
+    """As a dense least squares has it, at nodes of the datum and at others; half of them do."""
+    found, _ = readings(plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, (1, 0))),
+                        np.random.default_rng(10))
+    half = (nodes - 1) / 2
+    known = np.abs(np.indices((nodes, nodes)) - half).max(axis=0) < 0.7499 * half
+    for _ in range(2):
+        known = dense(found, known)[1].max(axis=0) < 3
+    assert known.sum() == count
+    emap = calibrate(found, LINEAR).error_map
+    assert np.array_equal(emap.valid, known)
+
+
 def test_a_result_keeps_plate_and_map_apart():
     """RESULT.json has the plate, its error, and the grid of the map; both are read back."""
     found, _ = readings(plate(11, 7), SIX, np.random.default_rng(7))

@@ -89,7 +89,7 @@ def dense(measurements: Measurements,
           known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return G in its datum and its standard uncertainty for unit noise, (2, nx, ny) each.
 
-    The datum is that of the `known` nodes, of all unless they are given; others are NaN.
+    The datum is that of the `known` nodes, of all unless they are given.
 
     By one matrix of all readings and unknowns, linear in the rotations, and its pseudo-inverse.
     """
@@ -114,7 +114,6 @@ def dense(measurements: Measurements,
     there = np.tile(np.ones(n, dtype=bool) if known is None else known.ravel(), 2)
     projected = inverse[:2 * n] - modes @ np.linalg.lstsq(
         modes[there], inverse[:2 * n][there], rcond=None)[0]
-    projected[~there] = np.nan
     return ((projected @ y).reshape(2, *artifact.field.shape),
             np.sqrt((projected**2).sum(axis=1)).reshape(2, *artifact.field.shape))
 

@@ -207,6 +207,12 @@ class Gauge:
         n = self.known.size
         return q[:n] + 1j * q[n:]
 
+    @property
+    def everywhere(self) -> np.ndarray:
+        """The modes of `orthonormal` at all sites, complex (sites, modes)."""
+        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[:len(self._rows)].T
+        return modes @ (self._gram_inverse @ np.real(self._rows.conj() @ self.orthonormal))
+
     @cached_property
     def shear(self) -> np.ndarray:
         """Rows that give O and R of Hu eq. 6, times the half width: complex (2, nx, ny)."""

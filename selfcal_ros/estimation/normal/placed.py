@@ -173,24 +173,27 @@ class PlacedEquations(NormalEquations):
         for _ in range(2):
             if known.sum() < 3:
                 return np.zeros(views.shape, dtype=bool)
-            rigid = Gauge(views.z_sites, known, scale=True).orthonormal
+            datum = Gauge(views.z_sites, known, scale=True)
             nodes = identity(self.grid.n_sites, format="csr")
-            largest = np.maximum(*self.variance(nodes, rigid, inverse))
+            largest = np.maximum(*self.variance(
+                nodes, datum.orthonormal, inverse, everywhere=datum.everywhere))
             known = some & (largest.reshape(views.shape) < KNOWN**2)
         return known
 
-    def variance(self, rows: csr_matrix, rigid: np.ndarray,
-                 inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances of Gx and Gy at places, in a datum over these places, unit noise.
+    def variance(self, rows: csr_matrix, rigid: np.ndarray, inverse: np.ndarray, *,
+                 everywhere: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Gx and Gy at places, in a datum over some of them, unit noise.
 
         Parameters
         ----------
         rows : sparse matrix (P, n)
             From the unknowns of the map to the places.
         rigid : complex array (P, 4)
-            Orthonormal datum modes at the places (real inner product).
+            Datum modes at the places of the datum, 0 at others, orthonormal (real inner product).
         inverse : float array (size, size)
             Covariance of the misalignments.
+        everywhere : complex array (P, 4), optional
+            The same modes at all places, if some are not of the datum.
         """
         n = 3 * self.grid.n_views
         solved = rows @ self.grid.factor.inverse
@@ -199,8 +202,9 @@ class PlacedEquations(NormalEquations):
             own @ np.real(response.conj().T @ rigid))
         inner = np.real(rigid.conj().T @ spread)
         common, out = np.asarray(rows.multiply(solved.real).sum(axis=1)).ravel(), []
+        modes = rigid if everywhere is None else everywhere
         for part in (np.real, np.imag):
-            b, s, y = part(rigid), part(spread), part(response)
+            b, s, y = part(modes), part(spread), part(response)
             out.append(common + np.einsum("pa,pa->p", y @ own, y)
                        + np.einsum("pk,pk->p", b @ inner - 2 * s, b))
         return out[0], out[1]
