@@ -158,7 +158,7 @@ class Noise:
     def dof_of(self, kind: str) -> float:
         """Return the degrees of freedom of the map's uncertainty, ``xy`` or ``theta``.
 
-        Older results have those of the noise alone.
+        Where they are not known, those of the noise alone.
         """
         found = float(getattr(self, f"dof_map_{kind}"))
         return found if found > 0 else float(getattr(self, f"dof_{kind}"))

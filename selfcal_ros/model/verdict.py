@@ -37,8 +37,8 @@ class Finding:
         Location: name of the view, ``x`` or ``y``; empty if not applicable.
     mark : tuple of int
         Mark (m, n) or line (k,) of a single reading; else empty.
-    details : dict, optional
-        Further data of its sentence, by name; None in files of older versions.
+    details : dict
+        Further data of its sentence, by name.
     text : str
         Its sentence; empty before wording.
     """
@@ -51,7 +51,7 @@ class Finding:
     view: str = ""
     axis: str = ""
     mark: tuple[int, ...] = ()
-    details: dict[str, Any] | None = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
     text: str = ""
 
 
@@ -262,8 +262,8 @@ def finding_to_dict(found: Finding) -> dict[str, Any]:
 
 
 def findings_from_list(kind: type, data: Any) -> tuple:
-    """Return findings, or causes; those of older versions have no details."""
-    return tuple(read(kind, {"details": None} | found | {"remedies": [
+    """Return findings, or causes."""
+    return tuple(read(kind, found | {"remedies": [
         {"kind": name, "value": value} for remedy in found.get("remedies", [])
         for name, value in remedy.items()]}) for found in read(list, data))
 
@@ -299,11 +299,11 @@ def line_to_dict(line: BudgetLine) -> dict[str, Any]:
 
 
 def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
-    """Return the lines of a budget; none of those of files that have other columns."""
+    """Return the lines of a budget."""
     return tuple(
         read(BudgetLine, row | {"dof": math.inf if row["dof"] is None else row["dof"],
                                   "kind": row["type"]})
-        for row in read(list, rows) if "effect_rms" in read(dict, row))
+        for row in read(list, rows))
 
 
 def provenance_from_dict(data: dict | None) -> Provenance:

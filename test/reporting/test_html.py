@@ -98,8 +98,7 @@ def test_causes_come_as_a_table_with_one_unit_each():
     result, _ = known_result(3, 0)
     causes = (Cause("drift", 8e-8, 3e-9, "m", 1e-9, "run 2: shift x", "x", remedies=(
         Remedy("model", "drift:8e-8"), Remedy("action", "measure there and back"))),
-              Cause("noise", 2.0, 0.1, "m/m", 2e-4, details=None,
-                    text="view 'a' is 2 times as noisy: measure it again"))
+              Cause("noise", 2.0, 0.1, "m/m", 2e-4, "a"))
     verdict = Verdict(Grade.NOT_QUALIFIED, causes=causes, reasons=("grid readings: too much",),
                       sentence="Not qualified: most likely drift")
     html = html_of(replace(result, verdict=verdict))
@@ -110,8 +109,8 @@ def test_causes_come_as_a_table_with_one_unit_each():
     assert cells[at:at + 7] == ["drift", what, "0.0800", "0.0030", "µm", "1e-09",
                                 "solve with --model drift:8e-8, or measure there and back"]
     assert cells[at + 7:at + 14] == [
-        "noise", "view &#x27;a&#x27; is 2 times as noisy: measure it again", "2.00", "0.10",
-        "times", "0.0002", ""]
+        "noise", "2.00 times as much noise in view &#x27;a&#x27; as in the others", "2.00", "0.10",
+        "times", "0.0002", "measure the view again, and look for a source of vibration"]
     assert "failed: grid readings: too much" in html
 
 

@@ -29,7 +29,7 @@ def noise_of(lines: int) -> Noise:
     """Return the noise of five repeats; nothing is known of theta on a plate without lines."""
     theta = (SIGMA_RAD, 384, 44) if lines else (float("nan"), 0, 0)
     return Noise(SIGMA_M, theta[0], SIGMA_M, theta[0], 1.02 * SIGMA_M, 0.98 * theta[0],
-                 2904, theta[1], 220, theta[2])
+                 2904, theta[1], 220, theta[2], dof_xy=2904, dof_theta=theta[1])
 
 
 def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int = 0,
@@ -47,7 +47,8 @@ def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int 
     nonorthogonality, scale = first_order(artifact, gx, gy)
     emap = ErrorMap(artifact, gx, gy, u, u.copy(), g_theta, u_theta, nonorthogonality, scale)
     views = tuple(ViewResult(v.name, v.rotation_rad, *v.translation_m, truth.phi_rad[i],
-                             *truth.t_m[i], used=600 + i, rejected=i)
+                             *truth.t_m[i], used=600 + i, rejected=i,
+                             read_grid=int(v.grid), read_angular=int(v.angular))
                   for i, v in enumerate(plan.views))
     result = CalibrationResult(
         plan.plan_id, emap, ArtifactMap(*truth.a, truth.a_theta), views,

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Covariances of saved maps, from the weights of the readings in RESULT.json.
 
-They are exact, including reference length and terms of the model. A RESULT.json of version 0.1 has
-no weights: then the correlations are those of its views without a missing mark, and the
-variances those of the map.
+They are exact, including reference length and terms of the model. Without weights, only the
+variances of the map are known.
 """
 
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
@@ -21,9 +19,8 @@ from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.systems import Marks, planned_system, system_of
+from selfcal_ros.estimation.normal.systems import Marks, system_of
 from selfcal_ros.estimation.observability.prediction import theta_matrix
-from selfcal_ros.estimation.observability.rank import deficiency
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import PRIOR, CalibrationResult
@@ -47,22 +44,17 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
     if "xy" in (stored := result.extra.get(COVARIANCE, {})):
         return _stored(stored, "xy", np.tile(emap.valid, (2, 1)), np.tile(known, (2, 1)))
-    system = system_behind(result)
-    if system is None or known.size > MAX_SITES or not np.isfinite(u).all():
+    if known.size > MAX_SITES or not np.isfinite(u).all():
         return u**2, False
     if result.method == "law":
         law, both = law_covariance(result), np.tile(known.ravel(), 2)
         return (u**2, False) if law is None else (_sized(law[0][np.ix_(both, both)], u), True)
-    if _lacks_terms(result):
+    system = system_behind(result)
+    if system is None or _lacks_terms(result):
         return u**2, False
     rows = unit_rows(known)
     if is_flipped(result):
         rows = rows[:, ::-1, ::-1]
-    if not tells_what_was_read(result):
-        cover = _field(system).of(rows)
-        noise, scale = _powers(result, system)
-        place = np.concatenate([result.artifact.x_m[known], result.artifact.y_m[known]])
-        return _sized(noise * cover + scale * np.outer(place, place), u), True
     cover = _exact_field(result, system).of(rows)
     factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
     return _sized(cover + factors.T @ factors, u), True
@@ -70,7 +62,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
 
 def _lacks_terms(result: CalibrationResult) -> bool:
     """Return whether the uncertainty has contributions of terms that the result does not keep."""
-    return bool(tells_what_was_read(result) and result.model.terms and KEY not in result.extra)
+    return bool(result.model.terms and KEY not in result.extra)
 
 
 def unit_rows(known: np.ndarray) -> np.ndarray:
@@ -87,13 +79,14 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
     u = result.error_map.u_g_theta[known]
     if "theta" in (stored := result.extra.get(COVARIANCE, {})):
         return _stored(stored, "theta", np.isfinite(result.error_map.g_theta), known)
-    system = system_behind(result)
-    if system is None or not system.angular.n_views or len(known) > MAX_LINES \
-            or not np.isfinite(u).all():
+    if len(known) > MAX_LINES or not np.isfinite(u).all():
         return u**2, False
     if result.method == "law":
         law = law_covariance(result)
         return (u**2, False) if law is None else (_sized(law[1][np.ix_(known, known)], u), True)
+    system = system_behind(result)
+    if system is None or not system.angular.n_views:
+        return u**2, False
     cover = theta_matrix(system, result.artifact, result.error_map.datum_theta,
                          sense=Sense(result.sense))
     if is_flipped(result):
@@ -133,27 +126,26 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
-    if PRIOR in result.extra:
+    if PRIOR in result.extra or result.method == "law":
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
+        cover, whole = xy_covariance(result, known)
+        if not whole:
+            return float("nan"), float("nan")
         z = (result.artifact.m + 1j * result.artifact.n).astype(complex)
         shear = Gauge(z, known, scale=True).shear[:, known]
         rows = np.concatenate([shear.real, shear.imag], axis=1)
-        u = np.sqrt(np.diag(rows @ xy_covariance(result, known)[0] @ rows.T)) / pitch_m
+        u = np.sqrt(np.diag(rows @ cover @ rows.T)) / pitch_m
         return float(u[0]), float(u[1])
     system = system_behind(result)
     if system is None or _lacks_terms(result):
         return float("nan"), float("nan")
     length = result.plate.grid_pitch_m * max(result.plate.reach)
-    if tells_what_was_read(result):
-        variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
-        shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
-        moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
-            "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
-        variance = variance + _added(result)
-        variance = (variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2
-    else:
-        variance = _powers(result, system)[0] * np.diag(_field(system).of(system.gauge.shear))
-    u = np.sqrt(variance) / length
+    variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
+    shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
+    moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
+        "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
+    variance = variance + _added(result)
+    u = np.sqrt((variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2) / length
     return float(u[0]), float(u[1])
 
 
@@ -165,36 +157,9 @@ def _added(result: CalibrationResult) -> np.ndarray:
     return found
 
 
-def _powers(result: CalibrationResult, system: NormalEquations) -> tuple[float, float]:
-    """Return the variances of a reading, m^2, and of the map's scale, from a map's u.
-
-    A map whose scale a reference length sets has u^2 = sigma^2 d + s^2 x^2, with d from the views.
-    """
-    artifact, emap = result.artifact, result.error_map
-    found = np.stack([emap.u_gx, emap.u_gy]) ** 2
-    unit = np.stack(_field(system).diagonal())
-    if is_flipped(result):
-        unit = unit[:, ::-1, ::-1]
-    place = np.stack([artifact.x_m, artifact.y_m]) ** 2
-    good = np.isfinite(found) & np.isfinite(unit)
-    sizes = np.array([unit[good].mean(), place[good].mean()])
-    target = found[good].mean()
-    columns = np.stack([unit[good], place[good]], axis=1) / sizes
-    powers = nnls(columns, found[good] / max(target, np.finfo(float).tiny))[0]
-    noise, scale = powers * target / sizes
-    return float(noise), float(scale)
-
-
 def is_flipped(result: CalibrationResult) -> bool:
     """Return whether the equations are solved for H(X) = -G(-X)."""
     return result.sense == Sense.PLATE_MOVES
-
-
-def _field(system: NormalEquations) -> FieldCovariance:
-    n = 3 * system.grid.n_views
-    inverse = np.zeros((system.size, system.size))
-    inverse[:n, :n] = system.grid_inverse
-    return FieldCovariance(system, inverse)
 
 
 def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
@@ -212,27 +177,12 @@ def bounded_inverse(result: CalibrationResult, system: NormalEquations) -> np.nd
                                         length) if system.angular.n_views else 1.0)
 
 
-def tells_what_was_read(result: CalibrationResult) -> bool:
-    """Return whether a result contains the weights of its readings."""
-    return bool(result.views) and all(
-        v.read_grid is not None and v.read_angular is not None for v in result.views)
-
-
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
-    """Return the system behind a result; None if unknown or the stage is not identified."""
-    if np.isnan(result.error_map.u_gx).all() or not result.views or "recheck" in result.extra:
+    """Return the system of the weights in a result; None if unknown or not identified."""
+    if np.isnan(result.error_map.u_gx).all() or not result.observability.identifiable \
+            or "recheck" in result.extra or not result.views \
+            or any(v.read_grid is None or v.read_angular is None for v in result.views):
         return None
-    if tells_what_was_read(result):
-        return _read_system(result) if result.observability.identifiable else None
-    views = _views(result)
-    if not any(view.grid for view in views):
-        return None
-    system = planned_system(result.plate, views)
-    return None if deficiency(system) else system
-
-
-def _read_system(result: CalibrationResult) -> NormalEquations:
-    """Return the system of the weights in a result."""
     artifact = result.plate
     grid, lines = [], []
     for index, v in enumerate(result.views):
@@ -282,17 +232,3 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
         raise InputError(where, "no weights of this field",
                          "write the result again with `selfcal solve`")
     return weight
-
-
-def _views(result: CalibrationResult) -> tuple[View, ...]:
-    """Return the views behind a result with the kinds of marks that were read in them.
-
-    The rotation of a view is known if its grid was read, or if its lines were and share their
-    rotation with a grid. Used readings without a known rotation are lines in separate views:
-    then no grid view has lines.
-    """
-    lines = result.artifact.angular_count > 0
-    alone = [lines and v.used > 0 and not np.isfinite(v.phi) for v in result.views]
-    return tuple(View(v.name, v.rotation, (v.translation_x, v.translation_y), bool(
-        np.isfinite(v.tx)), lines and (apart or not any(alone)))
-        for v, apart in zip(result.views, alone, strict=True) if apart or np.isfinite(v.phi))

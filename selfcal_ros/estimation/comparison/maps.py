@@ -22,7 +22,7 @@ from selfcal_ros.estimation.comparison.together import (
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
-from selfcal_ros.model.result import CalibrationResult, Noise
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import MM_PER_M
 
 DIFFERENCE_LEVEL = 0.05
@@ -289,29 +289,25 @@ def _theta_test(a: CalibrationResult, b: CalibrationResult, d_theta: np.ndarray,
 
 
 def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
-    """Return the effective degrees of freedom of the noise behind both uncertainties.
-
-    Welch-Satterthwaite; declared noise counts as known.
-    """
+    """Return the effective degrees of freedom of the noise behind both uncertainties."""
     parts = []
     for result in (a, b):
         emap = result.error_map
         u = emap.u_g_theta if kind == "theta" else np.stack([emap.u_gx, emap.u_gy])
         known = u[np.isfinite(u)]
         parts.append((float(np.mean(known**2)) if len(known) else 0.0,
-                      _dof_of(result.noise, kind)))
-    return sum(v for v, _ in parts)**2 / max(sum(v**2 / dof for v, dof in parts),
-                                             np.finfo(float).tiny)
+                      getattr(result.noise, f"dof_{kind}")))
+    return joint_dof(*parts)
 
 
-def _dof_of(noise: Noise, kind: str) -> float:
-    """Return the degrees of freedom of a noise; results of version 0.1 do not contain them."""
-    dof = getattr(noise, f"dof_{kind}")
-    if dof > 0:
-        return dof
-    dofs = {getattr(noise, f"sigma_{kind}_{way}"): getattr(noise, f"dof_{kind}_{way}")
-            for way in ("repeats", "residuals")}
-    return dofs.get(getattr(noise, f"sigma_{kind}")) or np.inf
+def joint_dof(*parts: tuple[float, float]) -> float:
+    """Return the degrees of freedom of a sum of variances (Welch-Satterthwaite).
+
+    A variance without degrees of freedom, one of declared noise, counts as known.
+    """
+    total = sum(variance for variance, _ in parts) ** 2
+    return float(total / max(sum(variance**2 / (dof if dof > 0 else np.inf)
+                                 for variance, dof in parts), np.finfo(float).tiny))
 
 
 @dataclass(frozen=True)

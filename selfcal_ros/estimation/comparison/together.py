@@ -17,7 +17,6 @@ from selfcal_ros.estimation.comparison.covariance import (
     bounded_inverse,
     is_flipped,
     system_behind,
-    tells_what_was_read,
     unit_rows,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
@@ -199,12 +198,9 @@ class Together:
 def together(result: CalibrationResult) -> Together | None:
     """Return what a result knows of stage and plate together; None if that is not all kept."""
     result = measured_alone(result)
-    if result.method != "joint" or not tells_what_was_read(result):
-        return None
-    kept = result.extra.get(KEY, {})
-    if result.model.terms and BESIDE not in kept:
-        return None
-    if max(result.artifact.m.size, result.plate.m.size) > MAX_SITES:
+    if result.method != "joint" or (
+            result.model.terms and BESIDE not in result.extra.get(KEY, {})) \
+            or max(result.artifact.m.size, result.plate.m.size) > MAX_SITES:
         return None
     system = system_behind(result)
     found = None if system is None else Together(result, system)

@@ -127,7 +127,7 @@ def robust_calibrate(measurements: Measurements,
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, options)
     left = tuple(found for found in cleaned.findings if found.name in LEFT
-                 or (found.details or {}).get("spoils"))
+                 or found.details.get("spoils"))
     verdict = result.verdict
     if left:
         verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
@@ -196,7 +196,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             continue
         at = replace(at, notes=(*at.notes, Finding(
             "taken_for_slip", cause.size, cause.u, cause.unit, cause.p, cause.view, cause.axis,
-            cause.mark, {**(cause.details or {}), "cause": cause.name, "told": cause.told,
+            cause.mark, {**cause.details, "cause": cause.name, "told": cause.told,
                          "slip_in": slip.view})))
         options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
         try:

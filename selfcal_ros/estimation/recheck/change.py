@@ -16,6 +16,7 @@ from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
     PITCH_TOLERANCE,
     Significance,
+    joint_dof,
     significance,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
@@ -95,7 +96,7 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
     if kept is None:
         raise InputError(where, "the covariance of its plate is not kept",
                          "calibrate jointly, with the uncertainty, a plate of at most 31 x 31 "
-                         "marks; results of version 0.1 do not have it")
+                         "marks")
     return KnownPlate(result, kept, where)
 
 
@@ -275,13 +276,6 @@ def _u_without(cover: np.ndarray, basis: np.ndarray) -> np.ndarray:
     q = np.linalg.qr(basis)[0]
     left = cover - q @ (q.T @ cover)
     return np.sqrt(np.maximum(np.diag(left - (left @ q) @ q.T), 0.0))
-
-
-def joint_dof(*parts: tuple[float, float]) -> float:
-    """Return the degrees of freedom of a sum of variances (Welch-Satterthwaite)."""
-    total = sum(variance for variance, _ in parts) ** 2
-    return float(total / max(sum(variance**2 / (dof if dof > 0 else np.inf)
-                                 for variance, dof in parts), np.finfo(float).tiny))
 
 
 def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

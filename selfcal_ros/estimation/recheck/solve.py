@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
 from selfcal_ros.estimation.joint.problem import (
@@ -34,7 +35,6 @@ from selfcal_ros.estimation.recheck.change import (
     KnownPlate,
     NewLines,
     NewMap,
-    joint_dof,
     line_change,
     map_change,
     on_plate,

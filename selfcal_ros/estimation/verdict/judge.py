@@ -118,7 +118,7 @@ def _with_declared(searched: SearchResult, options: Options) -> SearchResult:
     """Return what was found, with a note on causes that are declared to be exactly zero."""
     zero = {str(term.name) for term in options.terms if term.size == 0}
     return replace(searched, causes=tuple(
-        replace(cause, details={**(cause.details or {}), "declared": 0.0})
+        replace(cause, details={**cause.details, "declared": 0.0})
         if str(cause.name) in zero else cause for cause in searched.causes))
 
 

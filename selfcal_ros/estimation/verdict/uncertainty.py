@@ -221,7 +221,8 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     error. None without an uncertainty map.
     """
     lines, found = result.budget or tuple(budget_lines(result)), []
-    for quantity, dof in (("xy", _map_dof(result)), ("theta", _dof(result.noise, "theta"))):
+    for quantity, dof in (("xy", result.noise.dof_of("xy")),
+                          ("theta", _dof(result.noise, "theta"))):
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
         at_nodes = sum(line.effect_rms**2 for line in nodes)
@@ -259,23 +260,10 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
         yield _interpolation_theta(result)
 
 
-def _map_dof(result: CalibrationResult) -> float:
-    """Return the degrees of freedom of the XY map's uncertainty; older results do not have them."""
-    named = result.noise.dof_map_xy
-    if not named > 0:
-        noise = replace(result.noise, dof_xy=_dof(result.noise, "xy"))
-        named = with_coverage(replace(result, noise=noise)).noise.dof_map_xy
-    return named
-
-
 def _dof(noise: Noise, kind: str) -> float:
-    """Return the degrees of freedom of the noise behind the map; infinite if it is declared."""
-    dof = getattr(noise, f"dof_{kind}")
-    if dof > 0:
-        return float(dof)
-    sigma = getattr(noise, f"sigma_{kind}")  # results of version 0.1 do not have them
-    return next((getattr(noise, f"dof_{kind}_{way}") or np.inf for way in ("repeats", "residuals")
-                 if getattr(noise, f"sigma_{kind}_{way}") == sigma), np.inf)
+    """Return the degrees of freedom of the noise behind the map; infinite if unknown."""
+    dof = float(getattr(noise, f"dof_{kind}"))
+    return dof if dof > 0 else np.inf
 
 
 def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:

@@ -308,8 +308,8 @@ def remedies(cause: Cause) -> tuple[Remedy, ...]:
 
 
 def advice(cause: Cause) -> str:
-    """Return what to do about a cause; empty if a file has it only in the text of the cause."""
-    return "" if cause.details is None else ", or ".join(
+    """Return what to do about a cause."""
+    return ", or ".join(
         f"solve with --{remedy.kind} {remedy.value}" if remedy.kind in ("model", "map")
         else remedy.value
         for remedy in remedies(cause) if remedy.kind != "view")
@@ -321,8 +321,6 @@ def what_it_is(cause: Cause) -> str:
     For a cause from a file without its data this is the whole text.
     """
     try:
-        if cause.details is None:
-            return cause.text
         if "given" in cause.details:
             return _larger_term(cause, cause.details["given"])
         declared = ", declared to be exactly zero" * ("declared" in cause.details)
@@ -345,7 +343,7 @@ def _larger_term(cause: Cause, given: float) -> str:
 def sentence_of(found: Finding) -> str:
     """Return the sentence of a finding, for a cause with its remedies."""
     if found.name in SENTENCES:
-        return SENTENCES[found.name](found, found.details or {})
+        return SENTENCES[found.name](found, found.details)
     if not isinstance(found, Cause):
         raise KeyError(f"no words for {found.name}")
     return f"{what_it_is(found)}: {advice(found)}"

@@ -24,7 +24,7 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     if why is None or why.name != "rest_not_identified":
         return "" if why is None else sentence_of(why)
     more = "no single further view would change that"
-    if add := (why.details or {}).get("add"):
+    if add := why.details.get("add"):
         view = View("", add["rotation"], (add["translation_x"], add["translation_y"]),
                     add["grid"], add["angular"])
         more = f"with {plan_check.describe_view(view, artifact)} measured as well it could be"

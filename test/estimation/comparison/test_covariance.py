@@ -59,11 +59,6 @@ def test_covariance_of_a_saved_map(sense, reference):
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert correlated
     assert abs(found - wanted).max() < 1e-6 * wanted.max()
-    # as version 0.1 wrote it: a reference on an axis correlates the scale with that axis
-    found, correlated = xy_covariance(replace(result, views=tuple(
-        replace(v, read_grid=None, read_angular=None) for v in result.views)), known)
-    assert correlated
-    assert abs(found - wanted).max() < (0.02 if reference is None else 0.1) * wanted.max()
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -114,12 +109,15 @@ def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
     assert scaled == pytest.approx(plain, rel=0.05)
 
 
-def test_the_uncertainty_of_squareness_of_an_old_result_has_its_size():
-    """A result that does not keep what was read tells its noise by its uncertainty map."""
+def test_without_weights_only_the_variances_are_known():
     result = calibrate(measured(PLAN, 1), BARE)
-    old = replace(result, views=tuple(replace(v, read_grid=None, read_angular=None)
-                                      for v in result.views))
-    assert first_order_u(old) == pytest.approx(first_order_u(result), rel=0.02)
+    emap, bare_views = result.error_map, replace(result, views=tuple(
+        replace(v, read_grid=None, read_angular=None) for v in result.views))
+    found, correlated = xy_covariance(bare_views, emap.valid)
+    assert not correlated
+    assert found.tolist() == [*(emap.u_gx[emap.valid]**2), *(emap.u_gy[emap.valid]**2)]
+    assert theta_covariance(bare_views, np.isfinite(emap.g_theta))[1] is False
+    assert np.isnan(first_order_u(bare_views)).all()
 
 
 @pytest.mark.parametrize("keep_scale", [False, True])
@@ -194,7 +192,15 @@ def test_maps_of_the_law_have_the_covariance_of_their_readings(sense):
         return np.concatenate([g.ravel(), theta])
 
     np.testing.assert_allclose(solve(readings), map_of(result), rtol=0, atol=1e-18)
-    require_covariances(result, responses(solve, readings, sizes_of(readings, 2e-8, 2e-5)))
+    sizes = sizes_of(readings, 2e-8, 2e-5)
+    require_covariances(result, responses(solve, readings, sizes))
+
+    def first_order(moved):
+        emap = calibrate(moved, replace(options, uncertainty=False)).error_map
+        return np.array([emap.nonorthogonality, emap.scale_difference])
+
+    moved = responses(first_order, readings, sizes)
+    assert first_order_u(result) == pytest.approx(np.sqrt((moved**2).sum(axis=0)), rel=1e-4)
     test = compare(result, calibrate(measured(SMALL, 2, **how), options))
     assert test.xy.correlated and test.theta.correlated
     assert min(test.xy.p, test.theta.p) > 0.01

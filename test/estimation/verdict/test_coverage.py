@@ -84,10 +84,9 @@ def test_a_term_that_its_size_holds_adds_degrees_of_freedom_and_one_that_is_told
     assert told.dof_map_xy == told.dof_xy
 
 
-def test_older_results_have_the_degrees_of_freedom_of_their_noise():
+def test_a_map_without_degrees_of_freedom_has_those_of_its_noise():
     result = calibrated(reference=REFERENCE)
     nan = float("nan")
-    old = replace(result, noise=replace(result.noise, dof_map_xy=nan, dof_map_theta=nan))
-    assert old.noise.dof_of("xy") == result.noise.dof_xy
-    assert old.noise.dof_of("theta") == result.noise.dof_theta
-    assert budgets(old)[0].dof == pytest.approx(result.noise.dof_map_xy)
+    bare = replace(result, noise=replace(result.noise, dof_map_xy=nan, dof_map_theta=nan))
+    assert bare.noise.dof_of("xy") == result.noise.dof_xy == budgets(bare)[0].dof
+    assert bare.noise.dof_of("theta") == result.noise.dof_theta

@@ -126,7 +126,8 @@ def test_summary_shows_every_part():
     assert float(row[6]) == pytest.approx(1e6 * result.views[3].ty, abs=0.05)
     u_um = 1e6 * np.sqrt(np.mean(result.error_map.u_gx ** 2))
     assert f"u {u_um:.4f} µm rms, 0.0238 µm largest (k=1)" in text
-    assert f"U {2 * u_um:.4f} µm rms, 0.0476 µm largest (k=2, 95.45 %)" in text
+    assert (f"U {2 * u_um:.4f} µm rms, 0.0476 µm largest (k=2, 95.45 %, 2904 degrees of "
+            "freedom)") in text
     assert line_with(text, "x, y").split() == [
         "x,", "y", "(µm)", "0.0200", "0.0200", "2904", "0.0204", "220", "1.02"]
     assert line_with(text, "outlier").split() == ["outlier", "12"]
@@ -140,9 +141,9 @@ def test_orthogonality_and_scale_keep_their_signs_and_lengths():
     emap = replace(result.error_map, nonorthogonality=2e-6, scale_difference=-3e-6)
     text = summary_text(replace(result, error_map=emap))
     u_o, u_r = (f"{1e6 * u:.3g}" for u in first_order_u(result))
-    assert (f"O 2.00 ± {u_o} (k=1) µrad = 0.200 µm over 100 mm; axes out of square by "
+    assert (f"O 2.00 ± {u_o} (k=1) µrad = 0.200 µm over 100 mm; out of square by "
             "2|O| = 4.00 µrad") in text
-    assert (f"R -3.00 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; scales of X and Y differ by "
+    assert (f"R -3.00 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; X and Y differ by "
             "2|R| = 6.00") in text
     damaged = replace(result, extra={"covariance_terms": {"terms": ["x"], "factors": "no"}})
     assert "µrad" in summary_text(damaged)

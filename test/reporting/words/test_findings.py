@@ -298,8 +298,6 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
 
 
 def test_a_cause_of_a_file_without_its_data_is_its_text():
-    old = Cause("drift", 5e-8, 1e-9, "m", 1e-7, details=None, text="drift: visit there and back")
-    assert (what_it_is(old), advice(old)) == (old.text, "")
     damaged = replace(TURN, details={}, text="as it was said")
     assert what_it_is(damaged) == "as it was said"
 
