@@ -195,9 +195,9 @@ def error_section(result: CalibrationResult) -> Section:
                              (result.noise.k_xy, result.noise.dof_of("xy"))),
               *(("not in U", printable(excluded_text(line))) for line in result.excluded),
               ("non-orthogonality", _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad",
-                                                "axes out of square by 2|O|")),
+                                                "out of square by 2|O|")),
               ("scale difference", _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m",
-                                               "scales of X and Y differ by 2|R|"))]
+                                               "X and Y differ by 2|R|"))]
     if emap.artifact.angular_count:
         facts += _theta_facts(result)
     return Section("Stage error (indicated − true)", tuple(facts))
