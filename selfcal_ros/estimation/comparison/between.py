@@ -92,8 +92,8 @@ class Mean:
     weights : float array (runs,)
         Weights, sum 1.
     dof : float
-        Degrees of freedom of u, the median of all values; the fewest if nearly all that runs
-        differ by is the amplitude of a single shape.
+        Degrees of freedom of u, the median of all values; the fewest, runs - 1 where nothing is
+        shared, if nearly all that runs differ by is the amplitude of a single shape.
     deviations : tuple of Deviation
         Of each run.
     """
@@ -246,13 +246,14 @@ def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
     added = spread if covariance.ndim == 1 else (shapes * of_shapes) @ shapes.T + of_rest * (
         np.eye(len(q)) - q @ q.T - shapes @ shapes.T)
     covariance = covariance + pooled.sum() * added
-    whole = within + (weights @ shares) ** 2 * _diagonal(common) + between
+    shared_part = (weights @ shares) ** 2 * _diagonal(common)
     p = _p_between(parts, runs, own)
     single = p < RUNS_LEVEL and of_shapes.max(initial=0.0) > SINGLE * spread.sum()
+    dof = _dof_of_single(parts, of_shapes, weights, shared_part) if single else _dof(
+        runs, own, parts, (of_shapes, of_rest), weights, within + shared_part + between)
     return Mean(
-        weights @ values, covariance, within, (weights @ shares) ** 2 * _diagonal(common), between,
-        float(np.sqrt(spread.mean())), p, weights,
-        _dof(runs, own, parts, (of_shapes, of_rest), weights, whole, fewest=single),
+        weights @ values, covariance, within, shared_part, between,
+        float(np.sqrt(spread.mean())), p, weights, dof,
         tuple(_deviation(i, runs, values, own, common, weights, q, added)
               for i in range(len(runs))))
 
@@ -291,9 +292,8 @@ def _noise_dof(runs: list[Run], own: list[np.ndarray], factors: np.ndarray) -> f
 
 
 def _dof(runs: list[Run], own: list[np.ndarray], parts: _Parts,
-         between: tuple[np.ndarray, float], weights: np.ndarray, whole: np.ndarray, *,
-         fewest: bool) -> float:
-    """Return the degrees of freedom of the mean's u: the median of all values, or the `fewest`.
+         between: tuple[np.ndarray, float], weights: np.ndarray, whole: np.ndarray) -> float:
+    """Return the degrees of freedom of the mean's u, the median of all values.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
     which contains the part within runs, with one degree of freedom less than there are runs.
@@ -310,8 +310,22 @@ def _dof(runs: list[Run], own: list[np.ndarray], parts: _Parts,
         if 0 < run.dof < MANY_DOF:
             terms = terms + (w**2 * _diagonal(c)) ** 2 / run.dof
     found = (whole**2 / np.maximum(terms, TINY))[whole > 0]
-    return min(float(found.min() if fewest else np.median(found)), MANY_DOF) if len(
-        found) else MANY_DOF
+    return min(float(np.median(found)), MANY_DOF) if len(found) else MANY_DOF
+
+
+def _dof_of_single(parts: _Parts, of_shapes: np.ndarray, weights: np.ndarray,
+                   shared: np.ndarray) -> float:
+    """Return the degrees of freedom where runs differ by the amplitude of a single shape.
+
+    The value with the fewest: the scatter of the amplitude has as many as there are runs but one,
+    and what is shared is known. The noise within runs is not counted as known: the scatter
+    contains that of the amplitude, and the rest of it is small there.
+    """
+    m = int(np.argmax(of_shapes))
+    scatter = ((weights**2).sum() * of_shapes[m] + weights**2 @ parts.within[:, m]) * (
+        parts.shapes[:, m] ** 2)
+    ratio = float(np.min(shared[scatter > 0] / scatter[scatter > 0]))
+    return min((len(weights) - 1) * (1 + ratio) ** 2, MANY_DOF)
 
 
 def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray],

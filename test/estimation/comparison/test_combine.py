@@ -139,7 +139,7 @@ def test_a_single_number_that_differs_between_two_runs_has_one_degree_of_freedom
     """At the nodes that it moves: half of them it leaves alone, and the median would be large."""
     shape = np.array([[1.0], [0.0], [0.0], [-1.0]])
     single = mean_of([run_of(a * shape[:, 0], 0.01) for a in (-1.0, 1.0)], np.zeros((4, 0)), shape)
-    assert single.dof == pytest.approx(1.0, rel=0.05)
+    assert single.dof == pytest.approx(1.0, rel=1e-12)
 
 
 def test_the_datum_of_a_run_changes_nothing():
