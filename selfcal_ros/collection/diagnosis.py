@@ -6,7 +6,7 @@ a reason that does not name it. Here all rejections of a session are evaluated t
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -14,8 +14,13 @@ import numpy as np
 from selfcal_ros.collection.exposures import Exposures
 from selfcal_ros.collection.inputs import REMEDY, Kind, Reason
 from selfcal_ros.collection.marks.identify import IdentityRules
+from selfcal_ros.collection.marks.seen_poses import (
+    NamedMarks,
+    mirrored_alike,
+    seen_poses,
+    texts,
+)
 from selfcal_ros.collection.marks.stops import places_of_cells
-from selfcal_ros.estimation.checks.placing import Misplaced, other_poses, said
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.units import NS_PER_S
@@ -34,7 +39,7 @@ PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTIO
 
 Span = tuple[int, int] | None
 LOOKED_AT = 2000
-"""Number of the last detections whose stage positions are examined."""
+"""Number of the last detections of a view whose stage positions are examined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +58,16 @@ class Evidence:
         First and last stamp of each.
     encoder_step_s, max_gap_s : float
         Usual time between encoder samples (NaN = unknown), and the largest allowed.
-    stage_m, site_m : float array (2, n)
-        Indicated positions at grid detections with ids, and the nominal sites of their marks.
+    marks : tuple of NamedMarks
+        Grid marks with ids, of each view.
     pitch_m, limit_m : float
         Distance between marks, and largest distance of the stage from a mark's site.
     sense : Sense
         Sense of measurement.
     lies : str
-        Actual pose of the plate, and remedy, if the ids of the marks show another pose than
-        planned.
-    alone : bool
-        Whether no other view tells a wrong pose from wrong joints.
+        Pose of the plate, or what the ids are, and remedy, if the marks are not seen as planned.
+    joints : bool
+        Whether the joints may be wrong: no view is seen as planned.
     """
 
     rejected: Mapping[str, int]
@@ -75,13 +79,12 @@ class Evidence:
     commands_ns: Span = None
     encoder_step_s: float = float("nan")
     max_gap_s: float = 0.0
-    stage_m: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
-    site_m: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
+    marks: tuple[NamedMarks, ...] = ()
     pitch_m: float = 0.0
     limit_m: float = 0.0
     sense: Sense = Sense.MICROSCOPE_MOVES
     lies: str = ""
-    alone: bool = False
+    joints: bool = True
 
 
 @dataclass(frozen=True)
@@ -99,22 +102,25 @@ class RejectionFinding:
                 f"{self.text}")
 
 
-def main_reason(rejected: Mapping[str, int], used: int) -> tuple[str, int, int] | None:
+def main_reason(rejected: Mapping[str, int], used: int, *,
+                placed: bool = False) -> tuple[str, int, int] | None:
     """Return the reason of most rejections, its count, and the total considered; or None.
 
-    Detections of other runs and plans, redone views, and duplicates are not faults.
+    Detections of other runs and plans, redone views, and duplicates are not faults. `placed`:
+    whether all reasons of `PLACED` have one cause, and count together.
     """
     bad = {reason: count for reason, count in rejected.items() if reason in REMEDY}
     total = used + sum(bad.values())
     if total < AT_LEAST or not bad:
         return None
     reason = max(sorted(bad), key=lambda name: bad[name])
-    return (reason, bad[reason], total) if bad[reason] > MOST * total else None
+    count = sum(bad.get(one, 0) for one in PLACED) if placed and reason in PLACED else bad[reason]
+    return (reason, count, total) if count > MOST * total else None
 
 
 def diagnose(evidence: Evidence) -> RejectionFinding | None:
     """Return why most of the detections were rejected; None if no reason dominates."""
-    found = main_reason(evidence.rejected, evidence.used)
+    found = main_reason(evidence.rejected, evidence.used, placed=bool(evidence.lies))
     if found is None:
         return None
     reason, count, total = found
@@ -124,8 +130,7 @@ def diagnose(evidence: Evidence) -> RejectionFinding | None:
     elif reason == Reason.OUTSIDE_VIEWS:
         cause = _command_clock(evidence)
     elif reason in PLACED:
-        cause = "; or, if it lies as planned: ".join(filter(None, (
-            evidence.lies, _stage(evidence) if evidence.alone or not evidence.lies else None)))
+        cause = _stage(evidence)
     return RejectionFinding(reason, count, total, cause or REMEDY[Reason(reason)])
 
 
@@ -175,29 +180,48 @@ def _seconds(offset_s: float) -> str:
 
 def _stage(e: Evidence) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
-    where = e.stage_m * (-1 if e.sense is Sense.PLATE_MOVES else 1)
-    if where.shape[1] < AT_LEAST or (np.ptp(e.site_m, axis=1) < e.pitch_m).any():
+    joints = wrong_joints(e) if e.joints else None
+    if e.lies and len(e.marks) == 1:
+        return "; or, if it lies as planned: ".join(filter(None, (e.lies, joints)))
+    if joints or e.lies:
+        return "; or, if the joints are right: ".join(filter(None, (joints, e.lies)))
+    away = _away(e, lambda stage: stage)
+    if away <= e.limit_m:
         return None
-    if _away(where, e) <= e.limit_m:
+    where = np.concatenate([view.stage for view in e.marks]) * e.pitch_m
+    middle = complex(np.median(where.real), np.median(where.imag))
+    if np.quantile(np.abs(where - middle), 0.9) < e.pitch_m / 4:
+        middle *= -1 if e.sense is Sense.PLATE_MOVES else 1
+        return (f"the stage did not move: it is indicated at x = {middle.real:.6g} m, y = "
+                f"{middle.imag:.6g} m at all of them; name the joints that move, in joint_x and "
+                "joint_y")
+    check = "joint_x and joint_y, " if e.joints else ""
+    return (f"the stage stands {away:.3g} m from the sites of the marks that are seen (median); "
+            f"check {check}the ids of the marks and how the plate lies")
+
+
+def wrong_joints(e: Evidence) -> str | None:
+    """Return the fault of the joints without which the stage is at the marks of all views."""
+    if not _away(e, lambda stage: stage) > e.limit_m:
         return None
     for scale, swapped, signs in product(SCALES, (False, True), ((1, 1), (-1, -1), (-1, 1),
                                                                  (1, -1))):
-        tried = (where[::-1] if swapped else where) * np.array(signs)[:, None] / scale
-        if _away(tried, e) <= e.limit_m:
+        def tried(stage: np.ndarray, scale: float = scale, swapped: bool = swapped,
+                  signs: tuple[int, int] = signs) -> np.ndarray:
+            x, y = (stage.imag, stage.real) if swapped else (stage.real, stage.imag)
+            return (signs[0] * x + 1j * signs[1] * y) / scale
+
+        if _away(e, tried) <= e.limit_m:
             return _said(scale, swapped=swapped, signs=signs, sense=e.sense)
-    middle = np.median(where, axis=1)
-    if np.quantile(np.hypot(*(where - middle[:, None])), 0.9) < e.pitch_m / 4:
-        return (f"the stage did not move: it is indicated at x = {middle[0]:.6g} m, y = "
-                f"{middle[1]:.6g} m at all of them; name the joints that move, in joint_x and "
-                "joint_y")
-    return (f"the stage stands {_away(where, e):.3g} m from the sites of the marks that are seen "
-            "(median); check joint_x and joint_y, the ids of the marks and how the plate lies")
+    return None
 
 
-def _away(where: np.ndarray, e: Evidence) -> float:
-    """Return the median distance from the sites, for marks away from the centre."""
-    outer = np.hypot(*e.site_m) > e.pitch_m / 4
-    return float(np.median(np.hypot(*(where - e.site_m))[outer]))
+def _away(e: Evidence, changed: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Return the largest median distance of a view's marks from their sites, m; 0 if unknown."""
+    sites = np.concatenate([view.sites for view in e.marks] or [np.zeros(0, dtype=complex)])
+    if len(sites) < AT_LEAST or min(np.ptp(sites.real), np.ptp(sites.imag)) < 1:
+        return 0.0
+    return max(view.away(changed(view.stage)) for view in e.marks) * e.pitch_m
 
 
 def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
@@ -295,82 +319,64 @@ class DetectionsSeen:
             for reason, count in readings.rejected.items():
                 rejected[reason] = rejected.get(reason, 0) + count
         used = sum(readings.used for readings in views.values())
-        whole = self._finding(rejected, used, views, whole=True)
-        if whole is not None:
-            return {None: whole}
-        found = {index: self._finding(readings.rejected, readings.used, {index: readings})
-                 for index, readings in views.items()}
-        return {index: finding for index, finding in found.items() if finding is not None}
+        marks = self._named(views) if rejected.keys() & set(PLACED) else {}
+        limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
+        seen = seen_poses(marks, limit, self.rules.max_rotation_rad)
+        joints, told = not any(one.planned for one in seen.values()), texts(seen)
+        alike = (told.get(next(iter(views)), "") if len(views) == 1
+                 else mirrored_alike(seen.values()))
+        whole = self._evidence(rejected, used, marks, joints=joints, lies=alike)
+        finding = diagnose(whole)
+        found: dict[int | None, RejectionFinding | None] = {index: diagnose(self._evidence(
+            readings.rejected, readings.used, {i: marks[i] for i in marks if i == index},
+            joints=joints and not told, lies=told.get(index, ""), view=index))
+            for index, readings in views.items()}
+        named = {index: one for index, one in found.items() if one is not None}
+        if finding is None or (not alike and told.keys() & named.keys() and not (
+                finding.reason in PLACED and joints and wrong_joints(whole))):
+            return named
+        return {None: finding}
 
-    def _finding(self, rejected: Mapping[str, int], used: int, views: Mapping[int, ViewReadings], *,
-                 whole: bool = False) -> RejectionFinding | None:
-        if main_reason(rejected, used) is None:
-            return None
-        here = np.isin(self.view_of, list(views))
-        rows = np.flatnonzero(here if here.any() else np.ones(len(here), dtype=bool))
-        table, encoder = self.table[rows], self.encoder()
+    def _evidence(self, rejected: Mapping[str, int], used: int, marks: Mapping[int, NamedMarks], *,
+                  joints: bool, lies: str, view: int | None = None) -> Evidence:
+        """Return the facts on a view, or on all."""
+        here = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
+        table, encoder = self.table[here], self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
         missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
                         if not encoder.sampled[axis] and (table["kind"] == kind).any())
         came = (*(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
                 *encoder.foreign)
-        stage, site = self._stage_and_sites(rows[-LOOKED_AT:], views)
-        # if all views are affected the sense may be wrong: it looks like half a turn
-        alone = whole and len(views) == 1
-        lies = self._lies(rows[-LOOKED_AT:], views) if alone or not whole else ""
-        return diagnose(Evidence(
+        return Evidence(
             rejected, used, missing, came, _span(table["stamp"]), encoder.span_ns,
-            self.commands_ns, encoder.step_s, encoder.max_gap_s, stage, site,
+            self.commands_ns, encoder.step_s, encoder.max_gap_s, tuple(marks.values()),
             self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies,
-            alone))
+            joints)
 
-    def _lies(self, rows: np.ndarray, views: Mapping[int, ViewReadings]) -> str:
-        """Return the actual pose of a view's plate, if its marks match another pose."""
-        ((_, readings),) = views.items()
-        table, view = self.table[rows], readings.view
-        if not view.grid:
-            return ""
-        stage, limit = self.exposures.at(table["stamp"]), self.rules.stage_limit_m(self.artifact)
-        where = np.stack([stage.x.position, stage.y.position])
-        where *= -1 if self.sense is Sense.PLATE_MOVES else 1
-        good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
-        if self.artifact.marks:
-            good &= self.artifact.has(table["m"], table["n"])
-        places = np.zeros((2, len(table)))
-        places[:, good] = self.artifact.places(table["m"][good], table["n"][good])
-        where += places_of_cells(view, np.stack([table["ox"], table["oy"]]))
-        pose = view.on_stage(self.artifact)
-        away = []
-        for other in (pose, *other_poses(pose)):
-            site = np.stack(other.site_of(*places)) * self.artifact.grid_pitch_m
-            away.append(np.quantile(np.hypot(*(where - site))[good], 0.9) if good.any() else np.inf)
-        best = int(np.argmin(away))
-        if not best or away[best] > limit:
-            return ""
-        error = said(Misplaced.of(view.name, pose, [*other_poses(pose)][best - 1]))
-        return f"{error.what}; {error.remedy}"
-
-    def _stage_and_sites(self, rows: np.ndarray, views: Mapping[int, ViewReadings],
-                         ) -> tuple[np.ndarray, np.ndarray]:
-        """Return indicated positions and sites, both (2, n), of grid marks with ids."""
-        table, view_of = self.table[rows], self.view_of[rows]
-        pitch = self.artifact.grid_pitch_m
-        stage = self.exposures.at(table["stamp"])
-        where = np.stack([stage.x.position, stage.y.position])
-        good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where).all(axis=0)
-        good &= self.artifact.has(table["m"], table["n"])
-        parts = [np.zeros((4, 0))]
+    def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
+        """Return view_index -> the last of its marks with ids, as `sense` has them."""
+        found, pitch = {}, self.artifact.grid_pitch_m
         for index, readings in views.items():
-            here = good & (view_of == index)
-            if here.any() and readings.view.grid:
-                pose = readings.view.on_stage(self.artifact)
-                marks = self.artifact.places(table["m"][here], table["n"][here])
-                site = np.stack(pose.site_of(*marks)) * pitch
-                offset = np.stack([table["ox"][here], table["oy"][here]])
-                site = site - places_of_cells(readings.view, offset)
-                parts.append(np.concatenate([where[:, here], site]))
-        both = np.concatenate(parts, axis=1)
-        return both[:2], both[2:]
+            table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
+            stage = self.exposures.at(table["stamp"])
+            where = stage.x.position + 1j * stage.y.position
+            good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where)
+            good &= self.artifact.has(table["m"], table["n"])
+            if not (good.any() and readings.view.grid):
+                continue
+            x, y = self.artifact.places(table["m"][good], table["n"][good])
+            offset = np.stack([table["ox"][good], table["oy"][good]])
+            cells = places_of_cells(readings.view, offset)
+            sign = -1 if self.sense is Sense.PLATE_MOVES else 1
+            found[index] = NamedMarks(
+                readings.view.name, readings.view.on_stage(self.artifact), x + 1j * y,
+                sign * where[good] / pitch, _complex(cells) / pitch,
+                _complex(offset - cells) / pitch, listed=self.artifact.marks is not None)
+        return found
+
+
+def _complex(values: np.ndarray) -> np.ndarray:
+    return values[0] + 1j * values[1]
 
 
 def _span(stamps_ns: Iterable[int]) -> Span:

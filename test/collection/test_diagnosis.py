@@ -8,6 +8,8 @@ import pytest
 
 from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
 from selfcal_ros.collection.inputs import REMEDY, Reason
+from selfcal_ros.collection.marks.seen_poses import NamedMarks
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
@@ -32,10 +34,19 @@ def with_positions(cell, change):
     return cell.events
 
 
-def test_evidence_without_positions_holds_none():
-    nothing = Evidence({}, 0)
-    assert nothing.stage_m.shape == nothing.site_m.shape == (2, 0)
-    assert diagnose(nothing) is None
+def with_changed_ids(cell, change, view=None):
+    """Let the detections of a view (None = all) have the ids change(m, n)."""
+    stamps = [*(c.stamp_ns for c in cell.commands[::2]), 1 << 62]
+    begin, end = (0, stamps[-1]) if view is None else stamps[view:view + 2]
+    for index, d in enumerate(cell.detections):
+        if begin < d.stamp_ns < end:
+            m, n = change(d.m, d.n)
+            cell.spoil(index, m=m, n=n)
+    return cell.events
+
+
+def test_without_evidence_nothing_is_said():
+    assert diagnose(Evidence({}, 0)) is None
 
 
 def test_nothing_is_said_of_good_readings():
@@ -74,8 +85,9 @@ def test_the_other_sense(sense):
     other = next(s for s in Sense if s is not sense)
     assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {None: (
         "24 of 25 detections were rejected as stage_not_at_mark: the plate lies turned by 180°, "
-        "not by 0°; turn it as planned and measure this view again, or correct its pose in the "
-        "plan; or, if it lies as planned: the stage is indicated at minus the marks' sites; the "
+        "not by 0° (or its ids are those of other marks); turn it as planned and measure this view "
+        "again, or correct its pose in the plan; or, if it lies as planned: the stage is indicated "
+        "at minus the marks' sites; the "
         f"sense is the other one: measurement_sense {sense} (--sense {sense})")}
 
 
@@ -110,10 +122,11 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
 
 
 @pytest.mark.parametrize(("deg", "shift", "text"), [
-    (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37°; turn it counter-clockwise"),
-    (127, (0.013, -0.007), "the plate lies turned by 127°, not by 37°; turn it as planned and"),
-    (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37°; turn it as planned and measure"),
-    (37, (0.0, 0.0), "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches; "),
+    (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37° {ids}; turn it counter-"),
+    (127, (0.013, -0.007), "the plate lies turned by 127°, not by 37° {ids}; turn it as planned "),
+    (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37° {ids}; turn it as planned "),
+    (37, (0.0, 0.0), "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches "
+     "{ids}; "),
     (37, (-0.013, 0.007), "the plate lies shifted by (-1.3, +0.7) pitches, not by (+1.3, -0.7)")])
 def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
     """In one view; the others are placed as planned."""
@@ -124,7 +137,46 @@ def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
     found = findings(plan_events(truth, plan, settings=CellSettings(follow_mark=True), rng=rng,
                                  start_ns=START_NS))
     assert list(found) == [2]
-    assert f": {text}" in found[2]
+    ids = "(or its ids are those of other marks)"
+    assert f": {text.format(ids=ids)}" in found[2]
+    assert found[2].endswith("other views are as planned: leave the joints and the sense as they "
+                             "are")
+
+
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda m, n: (n, m), "the ids have m and n exchanged, or the plate lies upside down"),
+    (lambda m, n: (-n, -m), "the ids have m and n exchanged and both reversed, or"),
+    (lambda m, n: (-m, n), "the ids have m reversed, or the plate lies upside down"),
+    (lambda m, n: (m, -n), "the ids have n reversed, or the plate lies upside down"),
+    (lambda m, n: (-m, -n), "the plate lies turned by 270°, not by 90° (or its ids are those of"),
+    (lambda m, n: (m + 1, n), "the plate lies shifted by (+0, -1) pitches, not by (+0, +0)")])
+def test_ids_of_one_view_do_not_blame_the_joints(change, text):
+    """The joints are right in the other views: to change them would break these."""
+    cell = scene("0, 90, tx", count=0)
+    found = findings(with_changed_ids(cell, change, 1))
+    assert list(found) == [1]
+    assert text in found[1]
+    assert "joint_x" not in found[1] and "leave the joints and the sense as they are" in found[1]
+
+
+def test_ids_mirrored_in_all_views_may_be_the_joints():
+    found = findings(with_changed_ids(scene("0, 90, tx", count=0), lambda m, n: (n, m)))
+    assert list(found) == [None]
+    assert "the ids have m and n exchanged, or the plate lies upside down; correct the ids" in (
+        found[None])
+
+
+def test_exchanged_views_are_named_in_both():
+    plan = placed_plan(7)
+    lies = (None, plan.views[2], plan.views[1], None)
+    rng = np.random.default_rng(3)
+    truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
+    found = findings(plan_events(truth, plan, settings=CellSettings(follow_mark=True), rng=rng,
+                                 start_ns=START_NS))
+    assert sorted(found) == [1, 2]
+    for index, other in ((1, "37"), (2, "90")):
+        assert f"as planned for view '{other}'" in found[index]
+        assert "the views are exchanged; measure them in the order of the plan" in found[index]
 
 
 def test_mm_are_named_though_the_stage_seems_to_jump():
@@ -206,7 +258,10 @@ def test_every_reason_has_its_remedy_without_further_evidence(reason):
 
 
 def test_marks_on_one_line_do_not_tell_x_from_y():
-    site = np.stack([np.arange(-5, 6) * 0.01, np.zeros(11)])
-    told = diagnose(Evidence({"stage_not_at_mark": 10}, 0, stage_m=-site, site_m=site,
-                             pitch_m=0.01, limit_m=0.006))
+    marks = np.arange(-5, 6).astype(complex)
+    named = NamedMarks("0", View("0", 0.0, (0.0, 0.0)).on_stage(Artifact(11, 0.01, 0)), marks,
+                       -marks, 0 * marks, 0 * marks)
+    assert named.away(-marks) > 1
+    told = diagnose(Evidence({"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01,
+                             limit_m=0.006))
     assert told.text == REMEDY[Reason.NOT_AT_MARK]

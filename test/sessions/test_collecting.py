@@ -50,7 +50,8 @@ def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
     assert [level for level, _ in cell.said] == [Level.WARN]
     said = cell.said[0][1]  # one view does not tell both
     assert said.startswith("12 of 12 detections were rejected as stage_not_at_mark: the plate lies "
-                           "turned by 180°, not by 0°; turn it as planned")
+                           "turned by 180°, not by 0° (or its ids are those of other marks); turn "
+                           "it as planned")
     assert "the stage is indicated at minus the marks' sites; the sense is the other one" in said
     cell.feed(e for e in events.events if e.stamp_ns >= half)
     assert len(cell.said) == 1

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose of the plate in a view from where its named marks are seen, compared with the plan.
+
+A turn and a shift lead from the places of the marks on the plate to those on the stage. If they are
+not the planned ones, the plate has another pose, or the ids are those of other marks. If it takes a
+mirror, the ids are mirrored, or the plate lies upside down. Wrong joints affect all views: a
+view that is as planned shows that they are right.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from selfcal_ros.estimation.checks.placing import Misplaced, said
+from selfcal_ros.model.pose import StagePose
+
+AT_LEAST = 5
+"""Smallest number of named marks that show a pose."""
+SPREAD = 0.5
+"""Smallest standard deviation of their places along any direction, pitches."""
+STEPS = 6
+"""Steps to the pose by least absolute distances: single ids may be wrong."""
+SAME_SIZE = 0.1
+"""Largest deviation from 1 of the ratio of distances on stage and plate."""
+OFF_CENTRE = 0.25
+"""Distance from the centre of the field beyond which a site tells wrong joints, pitches."""
+NEAR = 0.3
+"""Distance, in pitches, within which a shift is taken to be a likely one."""
+SURELY = 0.5
+"""Largest ratio of the distances of the marks from their places, found over planned pose."""
+MIRRORS = {0: "{n} reversed", 90: "{m} and {n} exchanged", 180: "{m} reversed",
+           270: "{m} and {n} exchanged and both reversed"}
+"""Turn, deg, of the mirrored marks (m, -n) -> what the ids are."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMarks:
+    """Named marks of a view.
+
+    Attributes
+    ----------
+    view, pose : str, StagePose
+        Its name, and how the plan places the plate.
+    marks : complex array (n,)
+        Places on the plate, pitches.
+    stage : complex array (n,)
+        Places of the optical axis as indicated, in the sense of the measurement, pitches.
+    cells, offsets : complex array (n,)
+        Places in the image, and what the microscope measured from there, pitches.
+    listed : bool
+        Whether the plate is a list of marks.
+    """
+
+    view: str
+    pose: StagePose
+    marks: np.ndarray
+    stage: np.ndarray
+    cells: np.ndarray
+    offsets: np.ndarray
+    listed: bool = False
+
+    @property
+    def sites(self) -> np.ndarray:
+        """Planned sites of the marks, complex (n,), pitches."""
+        x, y = self.pose.site_of(self.marks.real, self.marks.imag)
+        return x + 1j * y
+
+    @property
+    def spread(self) -> bool:
+        """Whether the marks are enough to show a pose."""
+        if len(self.marks) < AT_LEAST:
+            return False
+        places = np.stack([self.marks.real, self.marks.imag])
+        return bool(np.linalg.eigvalsh(np.cov(places))[0] > SPREAD**2)
+
+    def away(self, stage: np.ndarray) -> float:
+        """Return the median distance of the stage from the planned sites off the centre."""
+        sites = self.sites
+        outer = np.abs(sites) > OFF_CENTRE
+        return float(np.median(np.abs(stage + self.cells - sites)[outer])) if outer.any() else 0.0
+
+
+@dataclass(frozen=True)
+class SeenPose:
+    """How a view's marks are seen: with the turn and shift found, or mirrored."""
+
+    pose: Misplaced
+    planned: bool
+    mirrored: bool
+    mirror: str = ""
+
+    def text(self, others: str) -> str:
+        """Return what is wrong, and the remedy, in one line; `others`: what other views show."""
+        if self.mirrored:
+            return (f"{self.mirror}, or the plate lies upside down; correct the ids, or lay the "
+                    f"plate as planned and measure this view again{others}")
+        error = said(self.pose)
+        return f"{error.what} (or its ids are those of other marks); {error.remedy}{others}"
+
+
+def seen_poses(views: Mapping[int, NamedMarks], limit: float,
+               max_rotation_rad: float) -> dict[int, SeenPose]:
+    """Return view_index -> how its marks are seen, of views that show it.
+
+    Parameters
+    ----------
+    views : dict
+        view_index -> named marks.
+    limit : float
+        Largest distance of the stage from the site of a mark, pitches.
+    max_rotation_rad : float
+        Largest rotation of a plate that lies as planned.
+    """
+    found = ((index, _seen(view, limit, max_rotation_rad)) for index, view in views.items())
+    return {index: seen for index, seen in found if seen is not None}
+
+
+def texts(seen: Mapping[int, SeenPose]) -> dict[int, str]:
+    """Return view_index -> what is wrong with views that are not seen as planned."""
+    wrong = {index: one for index, one in seen.items() if not one.planned}
+    right = len(wrong) < len(seen)
+    others = "; other views are as planned: leave the joints and the sense as they are" if (
+        right) else ""
+    exchanged = dict(_exchanged(wrong))
+    return {index: f"{exchanged[index]}{others}" if index in exchanged else one.text(others)
+            for index, one in wrong.items()}
+
+
+def mirrored_alike(seen: Iterable[SeenPose]) -> str:
+    """Return what the ids are, if those of all views are mirrored alike, and remedy; else empty."""
+    mirrors = {one.mirror if one.mirrored else "" for one in seen}
+    mirror = mirrors.pop() if len(mirrors) == 1 else ""
+    return f"{mirror}, or the plate lies upside down; correct the ids" if mirror else ""
+
+
+def _exchanged(wrong: Mapping[int, SeenPose]) -> Iterator[tuple[int, str]]:
+    """Yield the views in which the plate lies as planned for another one, and this one."""
+    for index, one in wrong.items():
+        for other, seen in wrong.items():
+            if other != index and not one.mirrored and _lies_as(one, seen) and _lies_as(seen, one):
+                yield index, (f"the plate lies as planned for view '{seen.pose.view}', and there "
+                              "as planned for this one: the views are exchanged; measure them in "
+                              "the order of the plan, or exchange them in the plan")
+
+
+def _lies_as(one: SeenPose, other: SeenPose) -> bool:
+    a, b = one.pose, other.pose
+    return not other.mirrored and a.found_deg == b.planned_deg and bool(
+        np.hypot(*np.subtract(a.found_shift, b.planned_shift)) < NEAR)
+
+
+def _seen(view: NamedMarks, limit: float, max_rotation_rad: float) -> SeenPose | None:
+    """Return how the marks of a view are seen; None if they do not show it."""
+    if not view.spread:
+        return None
+    pose, axis = view.pose, view.stage + view.cells
+    planned = float(np.quantile(np.abs(axis - view.sites), 0.9))
+    as_planned = Misplaced.of(view.view, pose, pose)
+    fits = [(*_fitted(view.marks, at, mirrored), mirrored) for mirrored in (False, True)
+            for at in (axis, axis + view.offsets)]
+    turn, shift, left, mirrored = min(fits, key=lambda fit: fit[2])
+    if planned <= limit and left > SURELY * planned:
+        return SeenPose(as_planned, planned=True, mirrored=False)
+    if left > limit:
+        return None
+    if mirrored:
+        back = np.degrees(np.angle(turn)) - pose.turn_deg
+        return SeenPose(as_planned, planned=False, mirrored=True,
+                        mirror=_mirror(back, listed=view.listed))
+    found = replace(as_planned, found_deg=_turn(turn, pose, max_rotation_rad),
+                    found_shift=_shift(shift, pose))
+    same = (found.found_deg, found.found_shift) == (found.planned_deg, found.planned_shift)
+    return SeenPose(found, planned=same, mirrored=False)
+
+
+def _fitted(marks: np.ndarray, at: np.ndarray, mirrored: bool,
+            ) -> tuple[complex, complex, float]:
+    """Return the turn, the shift and what nine of ten distances are below, pitches."""
+    z = marks.conj() if mirrored else marks
+    free, weight = np.stack([np.ones(len(z)), z], axis=1), np.ones((len(z), 1))
+    motion = np.zeros(2, dtype=complex)
+    for _ in range(STEPS):
+        motion = np.linalg.lstsq(weight * free, weight[:, 0] * at, rcond=None)[0]
+        weight = np.maximum(np.abs(at - free @ motion), NEAR / 10)[:, None] ** -0.5
+    size = abs(motion[1])
+    if abs(size - 1) > SAME_SIZE:
+        return 1, 0, float("inf")
+    turn = motion[1] / size
+    rest = at - turn * z
+    shift = complex(np.median(rest.real), np.median(rest.imag))
+    return turn, shift, float(np.quantile(np.abs(rest - shift), 0.9))
+
+
+def _turn(turn: complex, pose: StagePose, max_rotation_rad: float) -> float:
+    """Return a turn, 0 to 360 deg: a likely one, if it is within the rotation of a plate."""
+    deg = float(np.degrees(np.angle(turn)))
+    likely = (pose.turn_deg, -pose.turn_deg, 0.0, *(pose.turn_deg + 90.0 * q for q in (1, 2, 3)))
+    away = [abs((deg - one + 180) % 360 - 180) for one in likely]
+    best = int(np.argmin(away))
+    found = likely[best] if away[best] < np.degrees(max_rotation_rad) else round(deg)
+    return float(found % 360)
+
+
+def _shift(shift: complex, pose: StagePose) -> tuple[float, float]:
+    """Return a shift, pitches: a likely one, if it is near."""
+    a, b = pose.shift
+    likely = [(a, b), (-a, -b), (0, 0), (b, a), (-b, -a), (round(shift.real), round(shift.imag))]
+    away = [abs(shift - complex(*one)) for one in likely]
+    best = int(np.argmin(away))
+    return likely[best] if away[best] < NEAR else (round(shift.real, 1), round(shift.imag, 1))
+
+
+def _mirror(turn_deg: float, *, listed: bool) -> str:
+    """Return what the ids of mirrored marks are."""
+    quarter = round(turn_deg / 90)
+    if abs(turn_deg - 90 * quarter) > 45 * NEAR:
+        return "the ids are mirrored"
+    m, n = ("x", "y") if listed else ("m", "n")
+    what = "the list has" if listed else "the ids have"
+    return f"{what} {MIRRORS[90 * quarter % 360].format(m=m, n=n)}"
