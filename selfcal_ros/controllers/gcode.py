@@ -25,6 +25,7 @@ AXES = "XYZABCUVWE"
 OTHERS = AXES[2:]
 CYCLES = {"38.2", "38.3", "38.4", "38.5", "73", *map(str, range(81, 90))}
 """Motions of which only the end is corrected, as of G0."""
+HOMING = {"28", "28.2", "29", "30"}
 WORK = {"54", "55", "56", "57", "58", "59", "59.1", "59.2", "59.3"}
 REFUSED = {"10": "moves the coordinates", "52": "moves the coordinates", "92": "moves the "
            "coordinates", "16": "uses polar coordinates", "51": "scales", "68": "turns",
@@ -33,7 +34,14 @@ REFUSED = {"10": "moves the coordinates", "52": "moves the coordinates", "92": "
            "5": "is a spline", "5.1": "is a spline", "33": "is a thread", "76": "is a thread",
            "7": "uses diameters", "54.1": "moves the coordinates", "65": "calls a macro",
            "66": "calls a macro", "12": "is a pocket", "13": "is a pocket",
-           "70": "means inches or something else", "71": "means mm or something else"}
+           "70": "means inches or something else", "71": "means mm or something else",
+           "7.1": "wraps the plane round a cylinder", "12.1": "uses polar coordinates",
+           "112": "uses polar coordinates"}
+KNOWN = {"0", "1", "2", "3", "4", "9", "17", "18", "19", "20", "21", "40", "43", "43.1", "49", "50",
+         "53", "61", "61.1", "64", "69", "80", "90", "90.1", "91", "91.1", "92", "94", "95", "96",
+         "97", "98", "99", *CYCLES, *HOMING, *WORK}
+"""Words beside which X and Y are known to be positions."""
+LINE = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
 AT_END = {"0", "1", "2", "30", "60"}
 """M words that act once the motion has ended."""
 OF_SAMPLES = 1 / 8
@@ -67,13 +75,18 @@ def corrected_program(text: str, where: str, rewriter: "Rewriter") -> Corrected:
     InputError
         For a line that cannot be corrected.
     """
-    out, body = [], text.splitlines(keepends=True)
-    newline = "\r\n" if "\r\n" in text else "\n"
-    for number, line in enumerate(body, 1):
+    out, newline = [], _newline(text)
+    for number, line in enumerate(LINE.findall(text), 1):
         content = line.rstrip("\r\n")
         made = rewriter.line(content, f"{where}:{number}")
         out.append(newline.join(made) + line[len(content):])
     return Corrected("".join(out), rewriter.moves, rewriter.pieces)
+
+
+def _newline(text: str) -> str:
+    """Return the first end of a line in a text."""
+    found = re.search(r"\r\n|\r|\n", text)
+    return found[0] if found else "\n"
 
 
 def commented(program: str, comments: Sequence[str]) -> str:
@@ -82,10 +95,11 @@ def commented(program: str, comments: Sequence[str]) -> str:
     Between parentheses if the program has such comments, as not all controllers know both forms.
     """
     form = "({})" if "(" in re.sub(";.*", "", program) else "; {}"
-    newline = "\r\n" if "\r\n" in program else "\n"
+    newline = _newline(program)
     text = "".join(form.format(re.sub(r"[^ -~]|[()]", "_", line[:LONGEST])) + newline
                    for line in comments)
-    head = re.match(r"(?:\s*%[^\n]*\n)?(?:[ \t]*O\d[^\n]*\n)?", program, re.I | re.ASCII)
+    head = re.match(r"(?:\s*%[^\r\n]*[\r\n]+)?(?:[ \t]*O\d[^\r\n]*[\r\n]+)?", program,
+                    re.I | re.ASCII)
     at = head.end() if head else 0
     return program[:at] + text + program[at:]
 
@@ -136,7 +150,7 @@ class Rewriter:
         for code in codes:
             self._set(code)
         self._set_extruder({w.code for w in words if w.letter == "M"})
-        if {"28", "29", "30"} & set(codes):
+        if HOMING & set(codes):
             if {"X", "Y"} & set(values) or not set(AXES) & set(values):
                 self._forget()
             return [text]
@@ -174,6 +188,8 @@ class Rewriter:
                 why = ""
             if code in WORK and self._work not in ("", code):
                 why = "changes the origin, whose place is not known"
+            if not why and code not in KNOWN and {"X", "Y"} & set(values):
+                why = "is not known, and may mean something else by X and Y"
             if why:
                 raise InputError(where, f"G{code} {why}", "correct the program without it")
 
