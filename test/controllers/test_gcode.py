@@ -11,7 +11,7 @@ import pytest
 
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
-from selfcal_ros.controllers.gcode import Rewriter, corrected_program, simplified
+from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program, simplified
 from selfcal_ros.controllers.grid import Wiring, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -259,6 +259,10 @@ def test_increments_do_not_add_up_their_rounding():
     ("G1 X1 X2 Y0", "a.nc:1: a coordinate is given twice"),
     ("G0 X0 Y0\nG2 X10 Y0 R4", "a.nc:2: no arc of this radius"),
     ("G0 X0 Y0\nG2 X10 Y0 I4 J0", "a.nc:2: the ends of the arc are not equally far"),
+    ("G7.1 C50", "a.nc:1: G7.1 wraps the plane round a cylinder"),
+    ("G12.1", "a.nc:1: G12.1 uses polar coordinates"), ("G112", "a.nc:1: G112 uses polar"),
+    ("G0 X0 Y0\nG187 X1", "a.nc:2: G187 is not known, and may mean something else by X and Y"),
+    ("G0 X0 Y0\nG28.2 X0 Y0\nG1 X5", "a.nc:3: the position before this line is not known"),
     ("G18\nG0 X0 Y0\nG2 X1 Y0 I.5", "a.nc:3: the arc is not one turn in the XY plane"),
     ("G2 X1 Y0 I1", "a.nc:1: the arc is not one turn in the XY plane from a known point"),
     ("G0 X0 Y0\nG1 X60 Y20 Z1", "a.nc:2: Z before this line is not known, and the move is"),
@@ -275,6 +279,23 @@ def test_dwell_subprograms_and_homing():
     out = corrected(text).splitlines()
     assert (out[1], out[2], out[4]) == ("G4 X2.5", "G28 Z0", "M98 P100")
     assert out[0] != "G0 X0 Y0" and out[3] != "X1 Y1"
+
+
+def test_homing_and_words_without_coordinates_are_kept():
+    kept = ["G28.2 X0 Y0", "G187 P2", "G30 X0 Y0", "G4 X1"]
+    out = corrected("G0 X10 Y10\n" + "\n".join(kept) + "\nG1 X5 Y5\n").splitlines()
+    assert out[1:5] == kept and out[0] != "G0 X10 Y10" and out[5] != "G1 X5 Y5"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_each_end_of_line_is_kept_and_nothing_else_ends_a_line(end):
+    comment = "(form feed \x0c, next line \x85, separator \u2028 in it)"
+    out = corrected(end.join(["G0 X0 Y0 " + comment, "G1 X40 Y20 F100", "M2", ""]))
+    assert comment in out
+    lines = out.split(end)
+    assert not {"\r", "\n"} & set("".join(lines))
+    assert lines[-2:] == ["M2", ""] and len(lines) > 4
+    assert commented(out, ["first"]).split(end)[0] == "(first)"
 
 
 def test_a_move_of_one_axis_gets_the_other_as_well():
