@@ -6,6 +6,7 @@ import pytest
 
 from selfcal_ros.aerotech.evaluate import CalEvaluator
 from selfcal_ros.aerotech.export import (
+    AxisCorrection,
     length_m,
     line_table,
     map_line,
@@ -112,6 +113,26 @@ def test_straightness_has_no_slope():
     assert np.polyfit(flat.positions_m, flat.corrections_m, 1) == pytest.approx([0, 0], abs=1e-18)
     rest = line.corrections_m - flat.corrections_m
     np.testing.assert_allclose(np.diff(rest, 2), 0, atol=1e-20)
+
+
+def test_a_slope_is_removed_about_the_middle_of_positions_that_start_at_home():
+    x = np.arange(5) * 0.1
+    flat = without_slope(AxisCorrection(x, np.array([1.0, 0, 0, 0, 1.0]) * 1e-6 + 3e-6 * x))
+    np.testing.assert_allclose(flat.corrections_m, np.array([0.6, -0.4, -0.4, -0.4, 0.6]) * 1e-6,
+                               rtol=0, atol=1e-18)
+
+
+@pytest.mark.parametrize(("along", "half_m", "row"), [("x", 0.03, (slice(None), 2)),
+                                                      ("y", 0.02, (3, slice(None)))])
+def test_the_lines_of_an_oblong_field_are_its_middle_ones_from_edge_to_edge(along, half_m, row):
+    emap = replace(random_map(Artifact(7, 0.01, 0, 5), 2), nonorthogonality=4e-6)
+    for corrected, values in (("x", emap.gx), ("y", emap.gy)):
+        line = map_line(emap, along, corrected)
+        assert line.corrections_m.tolist() == values[row].tolist()
+        assert line.positions_m[[0, -1]] == pytest.approx([-half_m, half_m])
+    square = map_orthogonality(emap, along)
+    assert square.positions_m.tolist() == pytest.approx([-half_m, half_m])
+    assert square.corrections_m.tolist() == pytest.approx([-8e-6 * half_m, 8e-6 * half_m])
 
 
 @pytest.mark.parametrize("frame", FRAMES)
