@@ -38,6 +38,8 @@ PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTIO
 """Reasons possibly caused by a stage away from all marks."""
 
 Span = tuple[int, int] | None
+FAR_M = 1e9
+"""Distance beyond which a number is no place, whatever its unit."""
 LOOKED_AT = 2000
 """Number of the last detections of a view whose stage positions are examined."""
 
@@ -360,7 +362,8 @@ class DetectionsSeen:
             table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
             stage = self.exposures.at(table["stamp"])
             where = stage.x.position + 1j * stage.y.position
-            good = (table["kind"] == Kind.GRID) & table["has_id"] & np.isfinite(where)
+            good = (table["kind"] == Kind.GRID) & table["has_id"] & (np.abs(where) < FAR_M)
+            good &= np.hypot(table["ox"], table["oy"]) < FAR_M
             good &= self.artifact.has(table["m"], table["n"])
             if not (good.any() and readings.view.grid):
                 continue

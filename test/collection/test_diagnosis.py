@@ -159,6 +159,16 @@ def test_ids_of_one_view_do_not_blame_the_joints(change, text):
     assert "joint_x" not in found[1] and "leave the joints and the sense as they are" in found[1]
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300])
+def test_offsets_that_are_no_numbers_do_not_hide_the_ids_of_a_view(value):
+    cell = scene("0, 90, tx", count=0)
+    with_changed_ids(cell, lambda m, n: (n, m), 1)
+    for index in range(0, len(cell.detections), 7):
+        cell.spoil(index, offset_x=value)
+    found = findings(cell.events)
+    assert list(found) == [1] and "the ids have m and n exchanged" in found[1]
+
+
 def test_ids_mirrored_in_all_views_may_be_the_joints():
     found = findings(with_changed_ids(scene("0, 90, tx", count=0), lambda m, n: (n, m)))
     assert list(found) == [None]
