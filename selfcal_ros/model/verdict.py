@@ -303,7 +303,7 @@ def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
     return tuple(
         read(BudgetLine, row | {"dof": math.inf if row["dof"] is None else row["dof"],
                                   "kind": row["type"]})
-        for row in read(list, rows))
+        for row in (read(dict, one) for one in read(list, rows)))
 
 
 def provenance_from_dict(data: dict | None) -> Provenance:
