@@ -206,6 +206,10 @@ def run(args: argparse.Namespace) -> int:
             raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
                                        error.observability) from error
         raise
+    if options.plate is not None and options.plate.input.get("sha256") == bag_input(
+            args.bag)["sha256"]:
+        raise InputError(args.bag, f"the recording that {options.plate_from} was made of: it would "
+                         "be compared with itself", "record a new view of the plate")
     with busy("validating"):
         result, lines = _validated(args, measurements, options, result)
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))

@@ -54,6 +54,13 @@ def test_a_stage_that_is_as_it_was(folder, capsys):
     assert json.loads(capsys.readouterr().out)["significance_xy"]["correlated"] is False
 
 
+def test_the_calibrations_own_recording_is_refused(folder, capsys):
+    assert main(["recheck", str(folder / "r.json"), str(folder / "first")]) == 2
+    assert capsys.readouterr().err == (
+        f"selfcal recheck: {folder / 'first'}: the recording that {folder / 'r.json'} was made of: "
+        "it would be compared with itself; record a new view of the plate\n")
+
+
 def test_a_stage_that_has_changed(folder, capsys):
     out = folder / "bent.json"
     assert main(["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out),
