@@ -41,7 +41,7 @@ from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.simulation.machine import random_truth
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "test" / "bench"))
+sys.path[:0] = [str(ROOT), str(ROOT / "test" / "bench")]
 
 from ingest import PITCH_M  # noqa: E402
 from ingest_bags import FRONT, Recording, detection_rows, encoder_rows, recording  # noqa: E402
