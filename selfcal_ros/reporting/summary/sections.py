@@ -36,6 +36,7 @@ from selfcal_ros.reporting.summary.numbers import (
 )
 from selfcal_ros.reporting.words.findings import unit_of
 from selfcal_ros.reporting.words.phrases import counted_views, excluded_text
+from selfcal_ros.reporting.words.tables import dof_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -247,9 +248,8 @@ def _spread_facts(label: str, unit: Callable[[float], str], u: tuple[float, floa
         return [(label, "not known")]
     facts = [(label, f"u {unit(rms_u)} rms, {unit(max_u)} largest (k=1)")]
     if math.isfinite(k):
-        known = f", {dof:.0f} degrees of freedom" if math.isfinite(dof) else ""
         facts.append(("", f"U {unit(k * rms_u)} rms, {unit(k * max_u)} largest (k={k:.3g}, "
-                      f"95.45 %{known})"))
+                      f"95.45 %, {dof_text(dof)} degrees of freedom)"))
     return facts
 
 
@@ -276,7 +276,7 @@ def noise_section(noise: Noise) -> Section:
 
 def _dof(dof: float) -> str:
     """Return degrees of freedom as an integer; a dash where there are none."""
-    return f"{dof:.0f}" if dof else UNKNOWN
+    return dof_text(dof) if dof else UNKNOWN
 
 
 def truth_section(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> Section:
