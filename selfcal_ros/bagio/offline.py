@@ -153,9 +153,9 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
     return f"{hint} then remap it, or " if hint else ""
 
 
-def input_handlers(collector: Collector,
+def block_handlers(collector: Collector,
                    complaints: list[str]) -> dict[str, Callable[[Any], None]]:
-    """Return topic -> handler that converts a message and passes it to the collector.
+    """Return topic -> handler that passes the output of `BagReader.columns` to the collector.
 
     An unusable command is not fatal: it is counted, and reported in `complaints`.
     """
@@ -166,20 +166,12 @@ def input_handlers(collector: Collector,
             collector.refuse("command", Reason.COMMAND_BAD)
             complaints.append(f"a view command was not used: {error}")
 
-    return {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
-            DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
-            COMMAND_TOPIC: take_command}
-
-
-def block_handlers(collector: Collector,
-                 complaints: list[str]) -> dict[str, Callable[[Any], None]]:
-    """Return topic -> handler that passes the output of `BagReader.columns` to the collector."""
     def take_encoder(block: EncoderBlock) -> None:
         collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
                                     block.velocities)
 
     return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: collector.add_detection_block,
-            COMMAND_TOPIC: input_handlers(collector, complaints)[COMMAND_TOPIC]}
+            COMMAND_TOPIC: take_command}
 
 
 def bag_input(path: str | Path) -> dict[str, str]:

@@ -18,7 +18,6 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from selfcal_ros.collection.inputs import DETECTION
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.cdr import (
@@ -383,7 +382,5 @@ def _block(role: str, message: Any) -> Input:
         return to_model.EncoderBlock(np.array([sample.stamp_ns]), sample.names,
                                      np.array([sample.positions], dtype=float), velocities)
     if role == DETECTION_TOPIC:
-        d = to_model.detection(message)
-        return np.array([(d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x, d.offset_y,
-                          d.offset_theta, d.sigma, d.score)], dtype=DETECTION)
+        return to_model.detection(message).as_table()
     return message

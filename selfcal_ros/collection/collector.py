@@ -5,7 +5,6 @@ The result is a function of the set of messages alone, so that live nodes, a rep
 ``selfcal solve`` cannot differ. Nothing is discarded without being counted.
 """
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -73,7 +72,6 @@ class Collector:
         self._exposures = Exposures(self.tracks,
                                     approach_threshold_m=settings.approach_threshold)
         self._views = ViewCache(self._rules)
-        self._single: list[tuple] = []  # detections added one by one
         self._unsettled = 0
         self._commands: dict[inputs.Command, None] = {}
         self._rejected_input: Counter = Counter()
@@ -85,30 +83,13 @@ class Collector:
 
     def add_encoder(self, sample: inputs.EncoderSample) -> None:
         """Take one encoder message; an unusable one is counted under its reason."""
-        self.received["encoder"] += 1
-        velocities = sample.velocities or (math.nan,) * len(sample.positions)
-        if not len(sample.names) == len(sample.positions) == len(velocities):
-            self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += 1
-            return
-        known, finite = False, True
-        for name, position, speed in zip(sample.names, sample.positions, velocities, strict=True):
-            joint = self._joint(name)
-            if joint is None:
-                continue
-            known = True
-            if math.isfinite(position):
-                joint.add(sample.stamp_ns, position, speed)
-            else:
-                finite = False
-        if not finite:
-            self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += 1
-        if not known:
-            self._rejected_input[inputs.Reason.ENCODER_UNKNOWN_JOINT] += 1
-        self._grow(1)
+        self.add_encoder_block(np.array([sample.stamp_ns]), sample.names,
+                               np.array([sample.positions], dtype=float),
+                               np.array([sample.velocities], dtype=float))
 
     def add_encoder_block(self, stamps_ns: np.ndarray, names: Sequence[str], positions: np.ndarray,
                           velocities: np.ndarray | None = None) -> None:
-        """Take many encoder messages of the same joints, like `add_encoder` for each.
+        """Take encoder messages of the same joints; unusable ones are counted under their reason.
 
         Parameters
         ----------
@@ -154,9 +135,7 @@ class Collector:
 
     def add_detection(self, d: inputs.Detection) -> None:
         """Take one detection."""
-        self.received["detection"] += 1
-        self._single.append((d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x,
-                             d.offset_y, d.offset_theta, d.sigma, d.score))
+        self.add_detection_block(d.as_table())
 
     def add_detection_block(self, table: np.ndarray) -> None:
         """Take many detections: a structured array of `reduce.DETECTION`."""
@@ -171,9 +150,6 @@ class Collector:
             self._settle()
 
     def _settle(self) -> None:
-        if self._single:
-            self._views.append(np.array(self._single, dtype=inputs.DETECTION))
-            self._single = []
         self._views.changed_at(self._exposures.update(self._views.new_stamps()))
         self._unsettled = 0
 

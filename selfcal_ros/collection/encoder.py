@@ -57,10 +57,6 @@ class JointTrack:
         """Return the number of samples."""
         return len(self.store)
 
-    def add(self, stamp_ns: int, position: float, speed: float) -> None:
-        """Add one sample; `speed` is NaN if unknown."""
-        self.store.add(stamp_ns, position, speed)
-
     def between(self, start_ns: int, end_ns: int) -> "JointSamples":
         """Return the samples relevant to exposures from `start_ns` to `end_ns`."""
         half_gap = self.limits.max_gap_ns // 2

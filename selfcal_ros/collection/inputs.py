@@ -7,7 +7,7 @@ nanoseconds.
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from enum import IntEnum, StrEnum
 
 import numpy as np
@@ -88,6 +88,10 @@ class Detection:
     offset_theta: float
     sigma: float
     score: float
+
+    def as_table(self) -> np.ndarray:
+        """Return it as a table of one row, structured array (1,) of `DETECTION`."""
+        return np.array([astuple(self)], dtype=DETECTION)
 
 
 @dataclass(frozen=True, slots=True)

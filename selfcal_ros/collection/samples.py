@@ -9,7 +9,6 @@ neighbours. The result is always that of the whole set, in any order of arrival.
 import io
 import tempfile
 import weakref
-from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,14 +110,13 @@ class SampleStore:
     Attributes
     ----------
     newest_ns : int
-        Largest stamp of the samples added in blocks.
+        Largest stamp of the samples.
     problem : str
         Why blocks stay in memory beyond the limit; empty while the file can be written.
     """
 
     def __init__(self, limits: Limits | None = None) -> None:
         self._limits = limits or Limits()
-        self._single = (array("q"), array("d"), array("d"))  # added one by one
         self._filling = self._empty()  # the block that is being filled
         self._filled, self._rising, self._last_ns = 0, True, np.iinfo(np.int64).min
         self._blocks: list[_Block] = []
@@ -131,35 +129,16 @@ class SampleStore:
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        return self._count + len(self._single[0])
-
-    def add(self, stamp_ns: int, position: float, speed: float) -> None:
-        """Add one sample; `speed` is NaN if unknown."""
-        stamps, positions, speeds = self._single
-        stamps.append(stamp_ns)
-        positions.append(position)
-        speeds.append(speed)
-
-    def add_block(self, stamps_ns: np.ndarray, positions: np.ndarray,
-                  speeds: np.ndarray | None = None) -> None:
-        """Add samples in any order; `speeds` None or NaN if unknown."""
-        self._flush()
-        self._append(np.asarray(stamps_ns), np.asarray(positions), speeds)
-
-    def _flush(self) -> None:
-        if len(self._single[0]):
-            stamps, positions, speeds = (np.array(column) for column in self._single)
-            self._single = (array("q"), array("d"), array("d"))
-            self._append(stamps, positions, speeds)
+        return self._count
 
     def _empty(self) -> Samples:
         """Return the columns of an empty block, without memory pages until it is filled."""
         size = self._limits.block
         return np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
 
-    def _append(self, stamps: np.ndarray, positions: np.ndarray,
-                speeds: np.ndarray | None) -> None:
-        """Fill the open block, and close it when full."""
+    def add_block(self, stamps: np.ndarray, positions: np.ndarray,
+                  speeds: np.ndarray | None = None) -> None:
+        """Add samples in any order; `speeds` None or NaN if unknown."""
         start = 0
         while start < len(stamps):
             taken = min(self._limits.block - self._filled, len(stamps) - start)
@@ -248,14 +227,12 @@ class SampleStore:
 
     def new_stamps(self) -> np.ndarray:
         """Return the stamps added since the last call, rising."""
-        self._flush()
         unseen, self._unseen = self._unseen, []
         stamps = np.concatenate([NO_STAMPS, *unseen])
         return stamps if (stamps[1:] >= stamps[:-1]).all() else np.sort(stamps)
 
     def span(self) -> tuple[int, int] | None:
         """Return the first and the last stamp, None without samples."""
-        self._flush()
         stamps = self._open()[0]
         ends = [(b.first_ns, b.last_ns) for b in self._blocks]
         ends += [(int(stamps[0]), int(stamps[-1]))] if len(stamps) else []
@@ -263,7 +240,6 @@ class SampleStore:
 
     def count_between(self, start_ns: int, end_ns: int) -> int:
         """Return an upper estimate of the number of samples between two stamps."""
-        self._flush()
         stamps = self._open()[0]
         inside = int(np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns))
         return inside + int(self._counts[self._touched(start_ns, end_ns)].sum())
@@ -279,7 +255,6 @@ class SampleStore:
         or as many as exist. Samples received in the order of their stamps keep it. The result
         may be owned by the store and must not be written to.
         """
-        self._flush()
         open_samples = self._open()
         parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
         parts += [_cut(self._columns(self._blocks[number]), start_ns, end_ns, beside)

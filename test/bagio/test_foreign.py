@@ -9,7 +9,7 @@ import zstandard
 from rosbags.rosbag2 import CompressionMode, Reader
 
 from selfcal_ros.bagio.mcap_stream import McapStream
-from selfcal_ros.bagio.offline import collect_bag, input_handlers
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import Collector
@@ -18,7 +18,9 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.messages import to_model
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign
 from test.support.sessions import collected, decoded, events_of, small_plan
@@ -306,7 +308,9 @@ def played(path):
     messages = [(topic, typestore().deserialize_cdr(data, INPUT_TOPICS[topic]))
                 for topic, _, data in BagReader(path).cdr_messages()]
     collector = Collector(VALUES)
-    feed = input_handlers(collector, [])
+    feed = {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
+            DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
+            COMMAND_TOPIC: lambda m: collector.add_command(to_model.command(m))}
     for topic, message in messages:
         feed[topic](message)
     return calibrated(collector.collect()[0])

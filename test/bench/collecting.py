@@ -5,7 +5,7 @@ A stage visits the marks of a plate, a detection each period; the encoder sends 
 collector gets it in blocks of a tenth of a second, as a node does, and is asked for a status after
 every block of `--status` seconds. Stamps run as fast as the machine allows.
 
-    python test/bench/collecting.py [--hours 8] [--rate 1000] [--views 4] [--single]
+    python test/bench/collecting.py [--hours 8] [--rate 1000] [--views 4]
 """
 
 import argparse
@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.inputs import DETECTION, Command, EncoderSample, Kind, Phase
+from selfcal_ros.collection.inputs import DETECTION, Command, Kind, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import readings_digest
@@ -79,11 +79,7 @@ def run(args: argparse.Namespace) -> dict[str, float]:
             since = second + tenth / blocks + np.arange(round(args.rate / blocks)) * step
             where = positions(since, args.period, rng)
             stamps = START_NS + np.rint(since * S).astype(np.int64)
-            if args.single:
-                for t, p in zip(stamps.tolist(), where.tolist(), strict=True):
-                    collector.add_encoder(EncoderSample(t, JOINTS, tuple(p)))
-            else:
-                collector.add_encoder_block(stamps, JOINTS, where)
+            collector.add_encoder_block(stamps, JOINTS, where)
         exposed = np.arange(second, second + 1, args.period) + 0.35 * args.period
         collector.add_detection_block(detections(exposed, args.period, rng))
         busy += time.process_time() - begun
@@ -116,7 +112,6 @@ def main() -> None:
     parser.add_argument("--period", type=float, default=1.0, help="seconds between detections")
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--status", type=int, default=1, help="seconds between two statuses")
-    parser.add_argument("--single", action="store_true", help="encoder messages one by one")
     for name, value in run(parser.parse_args()).items():
         print(f"{name:18} {value:.4g}" if isinstance(value, float) else f"{name:18} {value}")
 

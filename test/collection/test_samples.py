@@ -17,7 +17,7 @@ def rows(columns):
 
 
 def stored(parts, *, speeds):
-    """Return a store and the list of all its samples; odd parts are added one by one."""
+    """Return a store and the list of all its samples; odd parts are added in pieces."""
     store, every = SampleStore(Limits(block=8, in_memory=1)), []
     for number, stamps in enumerate(parts):
         t = np.array(stamps, dtype=np.int64)
@@ -25,7 +25,7 @@ def stored(parts, *, speeds):
         v = p + 0.5 if speeds and number % 3 else None
         if number % 2:
             for at in range(len(t)):
-                store.add(int(t[at]), float(p[at]), np.nan if v is None else float(v[at]))
+                store.add_block(t[at:at + 1], p[at:at + 1], None if v is None else v[at:at + 1])
         else:
             store.add_block(t, p, v)
         every += rows((t, p, np.full(len(t), -1.0) if v is None else v))

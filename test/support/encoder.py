@@ -9,6 +9,9 @@ from selfcal_ros.collection import encoder
 class JointTrack(encoder.JointTrack):
     """The collector's track, with the answers of the series of all its samples."""
 
+    def add(self, stamp_ns: int, position: float, speed: float) -> None:
+        self.store.add_block(np.array([stamp_ns]), np.array([position]), np.array([speed]))
+
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         positions, codes = self._all().query(stamps_ns)
         return positions, encoder.REASONS[codes]
