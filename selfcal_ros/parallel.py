@@ -104,7 +104,7 @@ def _start_server(module: str) -> None:
 
 
 def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
-             dask: str = "", meanwhile: Callable[[], None] | None = None) -> Iterator[Outcome]:
+             dask: str = "") -> Iterator[Outcome]:
     """Yield the outcome of `function` for each item, as it becomes ready.
 
     Parameters
@@ -117,9 +117,6 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
         Processes; 1 = in this process, sequentially.
     dask : str
         Address of a dask scheduler, or `LOCAL`; empty = processes of the standard library.
-    meanwhile : callable, optional
-        Called once in a separate thread while other processes start and work, to load modules
-        here. It has returned when the last outcome is yielded.
 
     Raises
     ------
@@ -131,8 +128,7 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
     elif workers == 1 or len(items) < 2:
         yield from (_tried(function, items, index) for index in range(len(items)))
     else:
-        with _beside(meanwhile):
-            yield from _with_processes(function, items, min(workers, len(items)))
+        yield from _with_processes(function, items, min(workers, len(items)))
 
 
 def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
@@ -168,28 +164,6 @@ def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
         return Outcome(index, function(items[index]))
     except Exception as error:
         return Outcome(index, error=error)
-
-
-@contextlib.contextmanager
-def _beside(function: Callable[[], None] | None) -> Iterator[None]:
-    """Run `function`, if any, in a thread while the block runs; both end together.
-
-    This process waits for the one that forks workers, which is still importing.
-    If the block is aborted, by Ctrl-C or by the consumer of the outcomes, the function is not
-    waited for: the thread ends with the process. (An exception raised in it would leave the locks
-    of its imports taken.)
-    """
-    if function is None:
-        yield
-        return
-    thread = threading.Thread(target=function, daemon=True)
-    thread.start()
-    try:
-        yield
-    except Exception:
-        thread.join()
-        raise
-    thread.join()
 
 
 def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],

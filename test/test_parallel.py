@@ -6,7 +6,6 @@ import operator
 import os
 import subprocess
 import sys
-import threading
 from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
@@ -194,30 +193,6 @@ def test_an_interrupt_while_workers_import_is_left_to_their_parent(tmp_path):
     done = subprocess.run([sys.executable, "-c", WITH_WORKERS], capture_output=True, text=True,
                           check=False, env=os.environ | {"PYTHONPATH": str(tmp_path)})
     assert (done.returncode, done.stdout, done.stderr) == (0, "[True, True]\n", "")
-
-
-@pytest.mark.parametrize(("workers", "told"), [(2, [True]), (1, [])])
-def test_what_is_loaded_meanwhile_is_loaded_once_beside_the_workers(workers, told):
-    first, loaded = threading.Event(), []
-    values = []
-    for outcome in outcomes(abs, [-1, -2, -3, -4, -5], workers=workers,
-                            meanwhile=lambda: loaded.append(first.wait(300))):
-        first.set()  # what is loaded has waited for this outcome, and the outcome not for it
-        values.append(outcome.value)
-    assert sorted(values) == [1, 2, 3, 4, 5]
-    assert loaded == told
-
-
-def test_a_consumer_that_stops_does_not_wait_for_what_is_loaded_meanwhile():
-    """It stops by Ctrl-C: imports that take a second are nothing to wait for."""
-    stopped, loaded = threading.Event(), []
-    running = outcomes(abs, [-1, -2, -3], workers=2,
-                       meanwhile=lambda: loaded.append(stopped.wait(300)))
-    next(running)
-    running.close()
-    assert loaded == []
-    stopped.set()
-    assert mapped(abs, [-1, -2], workers=2) == [1, 2]  # with workers of another server
 
 
 def test_a_server_that_is_ended_has_ended_and_is_left_to_be_found_so():

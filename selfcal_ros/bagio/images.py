@@ -322,17 +322,16 @@ def _number(writer: BagWriter, item: Item, numbers: dict[tuple, int]) -> int:
     return numbers[key]
 
 
-def encoder_track(path: str | Path, joints: tuple[str, str] = ("x", "y"),
-                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps (n,), ns, and the indicated positions (n, 2) of two joints, by stamp.
+def encoder_track(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stamps (n,), ns, and the indicated positions (n, 2) of x and y, by stamp.
 
     Samples without these joints are left out.
     """
     stamps, places = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
     for _, block in BagReader(Path(path)).columns():
-        if isinstance(block, EncoderBlock) and set(joints) <= set(block.names):
+        if isinstance(block, EncoderBlock) and {"x", "y"} <= set(block.names):
             stamps.append(block.stamps_ns)
-            places.append(block.positions[:, [block.names.index(name) for name in joints]])
+            places.append(block.positions[:, [block.names.index(name) for name in "xy"]])
     stamp, place = np.concatenate(stamps), np.concatenate(places)
     order = np.argsort(stamp, kind="stable")
     return stamp[order], place[order]

@@ -29,7 +29,6 @@ from selfcal_ros.batch.table import (
 from selfcal_ros.cli.solve import add_options, parameters
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
-from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import write_json, write_text
 from selfcal_ros.parallel import begin, check_workers, outcomes
 from selfcal_ros.results import read_result
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
-    baseline = _baseline(args.baseline)
+    baseline = read_result(args.baseline) if args.baseline else None
     settings = Settings(*parameters(args), args.robust, args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
@@ -96,14 +95,6 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(records)
 
 
-def _baseline(file: str | None) -> "CalibrationResult | None":
-    """Return the map to compare with, None if there is none to be."""
-    if file is None:
-        return None
-
-    return read_result(file)
-
-
 def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
@@ -112,8 +103,7 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
     folder = Path(args.output).absolute()
     jobs = [Job(bags[place], folder, settings, args.redo) for place in places]
     with late_progress("solving bags") as progress:
-        for outcome in outcomes(_work_on, jobs, workers=workers, dask=args.dask or "",
-                                meanwhile=_load_table):
+        for outcome in outcomes(run_job, jobs, workers=workers, dask=args.dask or ""):
             place = places[outcome.index]
             if isinstance(outcome.error, SelfcalError):  # the folder cannot be written
                 raise outcome.error
@@ -121,14 +111,6 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
             _say(found[place])
             progress(len(found), len(jobs))
     return found
-
-
-def _work_on(job: "Job") -> "Record":
-    return run_job(job)
-
-
-def _load_table() -> None:
-    """Load the modules for the table: with SciPy's statistics it takes longer than a bag."""
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:

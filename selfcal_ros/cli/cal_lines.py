@@ -177,7 +177,7 @@ def add_line_tables(group: argparse._SubParsersAction) -> None:
                         "measured errors: a CSV with the header position,error (primary units; "
                         "um, actual - commanded).")
         sub.add_argument("source", metavar="RESULT.json|DATA.csv")
-        _common(sub, _straightness if name == "straightness" else _accuracy)
+        _common(sub, _line)
 
 
 def _common(parser: argparse.ArgumentParser, run: object) -> None:
@@ -240,16 +240,11 @@ def _orthogonality(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _accuracy(args: argparse.Namespace) -> int:
-    return _line(args, args.along)
-
-
-def _straightness(args: argparse.Namespace) -> int:
-    return _line(args, "y" if args.along == "x" else "x")
-
-
-def _line(args: argparse.Namespace, corrected: Axis) -> int:
+def _line(args: argparse.Namespace) -> int:
     frame, result = _frame(args), None
+    corrected: Axis = args.along
+    if args.sub_verb == "straightness":
+        corrected = "y" if args.along == "x" else "x"
     if Path(args.source).suffix.lower() == ".csv":
         _refuse_frame(args, "measured errors, whose positions are the controller's own",
                       "omit it")

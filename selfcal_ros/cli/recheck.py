@@ -6,13 +6,13 @@ import json
 
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, tell
-from selfcal_ros.collection.settings.estimator import calibration_of
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.planned import predict_recheck
 from selfcal_ros.model.view import Plan
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.summary.numbers import counted
+from selfcal_ros.results import read_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     if args.plan_verb == "suggest":
         raise InputError(args.plan, "its plate is known: any view that reads all marks will do",
                          "check the plan")
-    plate = known_plate(calibration_of(plan.artifact_from), plan.artifact_from)
+    plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
         found = predict_recheck(plan, plate)
     if args.json:

@@ -14,6 +14,7 @@ from typing import Any
 
 from rclpy.task import Future
 
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
@@ -23,7 +24,6 @@ from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.cell_check import CellCheck
 from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.sequencing import load_plan
 
 
 class CellChecker(SelfcalNode[CollectorSettings]):
@@ -66,7 +66,7 @@ class CellChecker(SelfcalNode[CollectorSettings]):
 def main() -> None:
     """Run the node: PLAN.yaml SETTLE_S PATIENCE_S."""
     try:
-        plan = load_plan(sys.argv[1])
+        plan = read_plan(sys.argv[1])
     except InputError as error:
         print(f"selfcal: {error}", file=sys.stderr)
         sys.exit(int(error.exit_code))

@@ -13,6 +13,7 @@ from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
 from selfcal_ros.collection.sequencer import State
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes import names
@@ -21,7 +22,7 @@ from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import plan_file_name
 from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.sequencing import SequencingSession, load_plan
+from selfcal_ros.sessions.sequencing import SequencingSession
 
 
 class CalibrationAction:
@@ -83,7 +84,7 @@ class CalibrationAction:
         result = RunCalibration.Result()
         try:
             if goal.request.plan_path:
-                self._session.machine.plan = load_plan(goal.request.plan_path)
+                self._session.machine.plan = read_plan(goal.request.plan_path)
             self._goal, self._ended = goal, Future()
             self._session.begin()
             await self._ended

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection import inputs
+from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.view import Plan, View
@@ -19,7 +20,6 @@ from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.health import Diagnosis, Level
-from selfcal_ros.sessions.sequencing import load_plan
 from selfcal_ros.simulation.bag import IMAGES, event_fields, image_fields, write_truth
 from selfcal_ros.simulation.cell import JOINTS, Event, view_events
 from selfcal_ros.simulation.exposing import Exposure, exposures
@@ -53,7 +53,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
             self._camera, spread = camera_of(given.camera)
         self._spread = spread_of(asdict(given), spread)
         self._grain = np.random.default_rng((given.seed, IMAGES))
-        self._plan: Plan | None = load_plan(given.plan) if given.plan else None
+        self._plan: Plan | None = read_plan(given.plan) if given.plan else None
         self.truth: Truth | None = None
         self._events: Iterator[Event | Exposure] = iter(())
         self._next: Event | Exposure | None = None

@@ -18,7 +18,7 @@ from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import placing_digest
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import View
 from selfcal_ros.sessions.clocks import is_future
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, Presence, StallWatch, missing_marks
 from selfcal_ros.topics import COMMAND_TOPIC
@@ -29,11 +29,6 @@ PATIENCE_S = 3.0
 
 SET_BACK_S = 0.1
 """Largest lag of the clock behind the newest command."""
-
-
-def load_plan(path: str) -> Plan:
-    """Return the plan in a PLAN.yaml."""
-    return read_plan(path)
 
 
 class SequencingSession:
@@ -50,7 +45,7 @@ class SequencingSession:
     def __init__(self, settings: SequencerSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         path = settings.plan
-        self.machine = Sequencer(load_plan(path) if path else None)
+        self.machine = Sequencer(read_plan(path) if path else None)
         self.presence = Presence(ports.now_s, PATIENCE_S)
         self.waiting = settings.auto_start
         self.run_id, self.coverage = "", 0.0

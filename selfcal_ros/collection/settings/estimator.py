@@ -12,7 +12,6 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
 from selfcal_ros.model.view import Plan
 from selfcal_ros.results import read_result
@@ -51,7 +50,7 @@ def plan_of(data: object, where: str, folder: Path) -> Plan:
         return plan_from_dict(data, where)
     source = str((folder / data["artifact_from"]).resolve())
     known = {} if "artifact" in data else plan_to_dict(
-        Plan("", calibration_of(source).plate, ()))
+        Plan("", read_result(source).plate, ()))
     plate = {key: known[key] for key in ("artifact", "map") if key in known}
     return plan_from_dict(plate | data | {"artifact_from": source}, where)
 
@@ -96,17 +95,6 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
     return columns
 
 
-def calibration_of(path: str) -> CalibrationResult:
-    """Return the calibration in a RESULT.json.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    return read_result(path)
-
-
 def solver_options(settings: SolverSettings, measurements: Measurements | None = None, *,
                    plate_from: str = "") -> Options:
     """Return the estimator's options in a solver's settings.
@@ -129,7 +117,7 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    uncertainty=UNCERTAINTY[settings.uncertainty],
                    terms=terms, terms_from=origin if terms else "", assumed=assumed,
                    drift_degree=settings.drift_degree, plate_from=plate_from,
-                   plate=calibration_of(plate_from) if plate_from else None,
+                   plate=read_result(plate_from) if plate_from else None,
                    magnification_limit=settings.magnification_limit,
                    prior="" if settings.prior == "none" else settings.prior)
 

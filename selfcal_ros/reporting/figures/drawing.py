@@ -4,6 +4,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 LEVELS = 10
 """Steps of a sequential scale, ``e0`` to ``e9`` (error) and ``v0`` to ``v9`` (uncertainty)."""
@@ -104,8 +105,8 @@ class Discs:
     radii: tuple[Point, ...]
     fill: str = ""
     stroke: str = ""
-    width: float = 1.0
     opacity: float = 1.0
+    width: ClassVar[float] = 1.0
 
 
 @dataclass(frozen=True)
@@ -159,12 +160,11 @@ class Drawing:
             self.items.append(Path(together, stroke=stroke, width=width))
 
     def shapes(self, outlines: Iterable[Iterable[Point]], *, fill: str, stroke: str = "",
-               width: float = 1.0, opacity: float = 1.0) -> None:
+               opacity: float = 1.0) -> None:
         """Fill outlines in one style."""
         together = tuple(tuple(outline) for outline in outlines)
         if together:
-            self.items.append(Path(together, fill=fill, stroke=stroke, width=width,
-                                   opacity=opacity))
+            self.items.append(Path(together, fill=fill, stroke=stroke, opacity=opacity))
 
     def box(self, left: float, top: float, width: float, height: float, *, fill: str = "",
             stroke: str = "") -> None:
@@ -173,13 +173,13 @@ class Drawing:
                                  (left, top + height), (left, top)),), fill=fill, stroke=stroke))
 
     def discs(self, centres: Sequence[Point], radii: Sequence[Point] | float, *, fill: str = "",
-              stroke: str = "", width: float = 1.0, opacity: float = 1.0) -> None:
+              stroke: str = "", opacity: float = 1.0) -> None:
         """Draw ellipses in one style; a single number is the radius of all."""
         if not len(centres):
             return
         sizes = ((float(radii), float(radii)),) * len(centres) if isinstance(
             radii, int | float) else tuple(radii)
-        self.items.append(Discs(tuple(centres), sizes, fill, stroke, width, opacity))
+        self.items.append(Discs(tuple(centres), sizes, fill, stroke, opacity))
 
     def label(self, x: float, y: float, text: str, *, size: float = 12.0, anchor: str = "start",
               colour: str = "ink", bold: bool = False, turned: bool = False) -> None:
@@ -317,6 +317,6 @@ def tick_text(value: float) -> str:
     return text.replace("-", "−")
 
 
-def span_of(values: Sequence[float], least: float = 0.0) -> float:
-    """Return the largest magnitude of the finite values; `least` or 1 if there is none."""
-    return max((abs(v) for v in values if math.isfinite(v)), default=0.0) or least or 1.0
+def span_of(values: Sequence[float]) -> float:
+    """Return the largest magnitude of the finite values; 1 if there is none."""
+    return max((abs(v) for v in values if math.isfinite(v)), default=0.0) or 1.0

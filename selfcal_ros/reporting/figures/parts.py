@@ -204,14 +204,13 @@ def arrow_key(frame: draw.Frame, factor: float, at: draw.Point) -> None:
     frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=draw.TICK + 1)
 
 
-def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point, *,
-           gap: float = 14.0) -> None:
+def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point) -> None:
     """Write texts in a row, each after a dot of its colour."""
     x, y = at
     for colour, words in entries:
         drawing.discs([(x + 4, y - 4)], 4.0, fill=colour)
         drawing.label(x + 12, y, words, size=draw.TICK + 1)
-        x += 12 + text_width(words, draw.TICK + 1) + gap
+        x += 12 + text_width(words, draw.TICK + 1) + 14
 
 
 def text_width(words: str, size: float) -> float:
