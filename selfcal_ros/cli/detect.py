@@ -8,8 +8,7 @@ from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
-from selfcal_ros.cli.solve import node_settings
-from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
@@ -19,6 +18,11 @@ from selfcal_ros.vision.exposures import ImageDetector
 
 SHOWN = 5
 """Number of problems that are printed."""
+
+
+OPTIONS = {name: name for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity",
+                                   "turn", "mirror")}
+"""Options for parameters of mark_detector -> their names."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -31,42 +35,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "with --positions")
     parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
                         "create: the detections and all other topics, without the images")
-    add_options(parser)
+    add_parameters(parser, DetectorSettings, OPTIONS)
+    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
+                        "of mark_detector is used")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the camera, for bags "
                         "with several cells; / is the root")
     add_json(parser)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the parameters of the detector."""
-    parser.add_argument("--pixel-size", type=float, metavar="M", help="side of a pixel on the "
-                        "plate, m")
-    parser.add_argument("--mark", choices=("disc", "ring", "cross", "corner"),
-                        help="kind of mark (default: disc)")
-    parser.add_argument("--mark-size", type=float, metavar="M", help="diameter of a disc or ring, "
-                        "length of the bars of a cross, side of the squares of a corner, m")
-    parser.add_argument("--mark-width", type=float, metavar="M", help="width of the line of a "
-                        "ring or cross, m (default: a fifth of its size)")
-    parser.add_argument("--polarity", choices=("dark", "bright"),
-                        help="marks on their ground (default: dark)")
-    parser.add_argument("--turn", type=float, metavar="DEG", help="angle by which the image is "
-                        "turned to lie along the stage axes, counter-clockwise (default: 0)")
-    parser.add_argument("--mirror", action="store_true", default=None,
-                        help="the image is mirrored: columns run along -x before the turn")
-    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
-                        "of mark_detector is used")
-
-
-def settings_of(args: argparse.Namespace) -> "DetectorSettings":
-    """Return the settings in the arguments."""
-    names = ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
-    return node_settings(args.params, DetectorSettings,
-                         **{name: getattr(args, name) for name in names})
-
-
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    settings = settings_of(args)
+    settings = node_settings(args.params, DetectorSettings, **given(args, OPTIONS))
     detector = ImageDetector(settings, args.params or "options")
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)

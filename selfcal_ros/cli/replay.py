@@ -11,12 +11,12 @@ from pathlib import Path
 
 from selfcal_ros.bagio.offline import bag_input, clock_lines
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
-from selfcal_ros.cli.solve import node_settings
 from selfcal_ros.cli.terminal import (
     add_json,
     aside,
     exit_code,
     file_of,
+    node_settings,
     on_stdout,
     progress_bar,
     put,

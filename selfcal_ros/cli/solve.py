@@ -9,10 +9,13 @@ from typing import Any
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.cli.terminal import (
     add_json,
+    add_parameters,
     aside,
     busy,
     exit_code,
     file_of,
+    given,
+    node_settings,
     on_stdout,
     progress_bar,
     put,
@@ -23,9 +26,7 @@ from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import (
     CollectorSettings,
-    Settings,
     SolverSettings,
-    overrides_in,
 )
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
@@ -34,7 +35,6 @@ from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
 from selfcal_ros.estimation.quality.validation import judged_by, validate
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.files import read_yaml
 from selfcal_ros.model.artifact import with_nodes
 from selfcal_ros.model.result import (
     created_now,
@@ -67,20 +67,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
+METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "misalignment_model",
+          "uncertainty": "uncertainty"}
+REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
+TERMS = {"drift_degree": "drift_degree", "prior": "prior"}
+SENSE = {"sense": "measurement_sense"}
+"""Options for parameters of solver and collector -> their names."""
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for collecting and solving a bag."""
-    parser.add_argument("--method", choices=("joint", "law"),
-                        help="joint least squares (default) or Hu's published law")
-    parser.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"),
-                        help="condition that fixes the constant of the angular map (default: "
-                             "zero_mean)")
-    parser.add_argument("--misalignment", choices=("rigid", "linear"),
-                        help="rotation of the plate: finite (rigid, default), or linear as in the "
-                        "papers (the only one for Hu's law)")
-    parser.add_argument("--uncertainty", choices=("auto", "always", "never"),
-                        help="uncertainty map; auto (default): up to 201 x 201 sites")
-    parser.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
-                        help="what moves (default: microscope_moves)")
+    add_parameters(parser, SolverSettings, METHOD)
+    add_parameters(parser, CollectorSettings, SENSE)
     parser.add_argument("--params", metavar="NODES.yaml",
                         help="ROS parameter file, the same as for the nodes")
     parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
@@ -88,12 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
                         "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
                         "marks marks:ID:ID:LENGTH:U")
-    parser.add_argument("--certificate", metavar="TEXT",
-                        help="certificate of the reference: number and issuer")
-    parser.add_argument("--reference-at", metavar="T:U_T:ALPHA:U_ALPHA[:T0]",
-                        help="move the certified length to the temperature of the measurement: "
-                        "T and its u, expansion coefficient and its u, temperature of the "
-                        "certificate (20), e.g. 20.4:0.05:0.5e-6:0.05e-6")
+    add_parameters(parser, SolverSettings, REFERENCE)
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help="terms estimated with the map: microscope, drift, plate_scale, "
                         "plate_shape, approach, plate_strain, line_eccentricity, rotation, yaw; "
@@ -103,12 +96,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
                         help="standard uncertainties of the microscope's scale, rotation (rad) "
                         "and shear (default: 0.01:0.01:0.002)")
-    parser.add_argument("--drift-degree", type=int, metavar="D",
-                        help="degree of a drift's polynomial (default: 3)")
-    parser.add_argument("--prior", choices=("none", "gp"),
-                        help="gp: take the stage's error for a smooth random field whose size and "
-                        "length the readings show; refused where they contradict it (default: "
-                        "none)")
+    add_parameters(parser, SolverSettings, TERMS)
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
     parser.add_argument("--robust", action="store_true",
@@ -116,23 +104,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "(docs/identifiability.md)")
 
 
-def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
-    """Return the settings of a node from a parameter file, if any, and arguments, which win."""
-    where = params or "options"
-    overrides = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
-    overrides |= {name: value for name, value in given.items() if value is not None}
-    return kind.checked(overrides, where)
-
-
 def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
     """Return the settings of collector and solver; options take precedence over the file."""
-    collector = node_settings(args.params, CollectorSettings, measurement_sense=args.sense)
-    solver = node_settings(
-        args.params, SolverSettings, method=args.method, theta_datum=args.theta_datum,
-        misalignment_model=args.misalignment, uncertainty=args.uncertainty,
-        model_terms=_model(args), drift_degree=args.drift_degree, prior=args.prior,
-        reference_certificate=args.certificate, reference_at=args.reference_at,
-        **_reference(args.reference))
+    collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
+    solver = node_settings(args.params, SolverSettings, model_terms=_model(args),
+                           **given(args, METHOD | REFERENCE | TERMS), **_reference(args.reference))
     for option in ("certificate", "reference_at"):
         if getattr(args, option) is not None and solver.reference_kind == "none":
             raise InputError(f"--{option.replace('_', '-')}",

@@ -6,10 +6,13 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TextIO
 
+from selfcal_ros.collection.settings.nodes import overrides_in
+from selfcal_ros.collection.settings.parameter import Settings
 from selfcal_ros.errors import ExitCode
+from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import json_text
@@ -22,6 +25,44 @@ STDOUT = "-"
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
     """Add the option ``--json``."""
     parser.add_argument("--json", action="store_true", help=f"print {what} (docs/json.md)")
+
+
+def add_parameters(parser: argparse.ArgumentParser, kind: type[Settings],
+                   options: Mapping[str, str]) -> None:
+    """Add options for parameters of a node, None if not given.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        The parser of the verb.
+    kind : type of Settings
+        The parameters of the node.
+    options : mapping
+        Name of the option without dashes -> name of the parameter.
+    """
+    known = {parameter.name: parameter for parameter in kind.parameters()}
+    for option, name in options.items():
+        parameter = known[name]
+        default = parameter.default
+        told = f" (default: {default})" if default else ""
+        how: dict[str, Any] = {"action": "store_true", "default": None} if default is False else {
+            "type": type(default), "choices": parameter.choices or None,
+            "metavar": None if parameter.choices else (parameter.unit or "value").upper()}
+        parser.add_argument(f"--{option.replace('_', '-')}", **how,
+                            help=f"{parameter.description}{told}".replace("%", "%%"))
+
+
+def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
+    """Return the settings of a node from a parameter file, if any, and arguments, which win."""
+    where = params or "options"
+    overrides = overrides_in(read_yaml(params) if params else {}, kind.NODE, where)
+    overrides |= {name: value for name, value in given.items() if value is not None}
+    return kind.checked(overrides, where)
+
+
+def given(args: argparse.Namespace, options: Mapping[str, str]) -> dict[str, Any]:
+    """Return parameter -> value of the options of `add_parameters`, None if not given."""
+    return {name: getattr(args, option) for option, name in options.items()}
 
 
 def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
