@@ -13,17 +13,19 @@ from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion
+from selfcal_ros.model.readings import (
+    COLUMNS,
+    VISIT_COLUMNS,
+    GridVisits,
+    Measurements,
+    RepeatMotion,
+)
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 Fields = dict[str, Any]
-
-VISIT_COLUMNS = ("mark", "dx", "dy", "count", "u", "offset_x", "offset_y", "approach_x",
-                 "approach_y")
-"""Columns of `GridVisits` named like their field in ViewMeasurement without visit_."""
 
 
 def header(stamp_ns: int, frame_id: str) -> Fields:
@@ -136,12 +138,11 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
     With images there is one message for each of the readings' parts.
     """
     readings = progress.readings
-    arrays = ("m", "n", "dx", "dy", "count", "k", "dtheta", "count_theta", "u", "u_theta")
     return {
         "header": header(stamp_ns, frame_id), "plan_id": measurements.plan_id,
         "view_index": progress.view_index, **_view(readings.view),
         **_artifact(measurements.artifact),
-        **{name: getattr(readings, name) for name in arrays},
+        **{name: getattr(readings, name) for name, _ in COLUMNS},
         "sigma_xy": readings.sigma_xy, "sigma_theta": readings.sigma_theta,
         "dof_xy": readings.dof_xy, "dof_theta": readings.dof_theta,
         "detections_used": readings.used,
@@ -159,10 +160,9 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
 
 def _visits(visits: GridVisits | None) -> Fields:
     """Return the fields of the visits of a view; empty if unknown."""
-    fields = {f"visit_{name}": getattr(visits, name) if visits else []
-              for name in VISIT_COLUMNS}
-    return {**fields, "visit_stamp": visits.stamp_ns if visits else [],
-            "sigma_visit": visits.sigma_m if visits else float("nan"),
+    fields = {f"visit_{name.removesuffix('_ns')}": getattr(visits, name) if visits else []
+              for name, _ in VISIT_COLUMNS}
+    return {**fields, "sigma_visit": visits.sigma_m if visits else float("nan"),
             "dof_visit": visits.dof if visits else 0}
 
 

@@ -21,17 +21,20 @@ from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.pose import Image
-from selfcal_ros.model.readings import GridVisits, RepeatMotion, Sense, ViewReadings
+from selfcal_ros.model.readings import (
+    COLUMNS,
+    VISIT_COLUMNS,
+    GridVisits,
+    RepeatMotion,
+    Sense,
+    ViewReadings,
+)
 from selfcal_ros.model.view import View, parse_order
 from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 MOST_NOTES = 20
 """Largest number of lines on the session."""
-_VISITS = (("mark", "mark", np.int64), ("dx", "dx", float), ("dy", "dy", float),
-           ("count", "count", np.int64), ("stamp", "stamp_ns", np.int64),
-           ("offset_x", "offset_x", float), ("offset_y", "offset_y", float),
-           ("approach_x", "approach_x", np.int8), ("approach_y", "approach_y", np.int8))
 TIME = (cdr.Field("sec", "i4"), cdr.Field("nanosec", "u4"))
 HEADER = (cdr.Field("stamp", TIME), cdr.Field("frame_id", cdr.TEXT))
 JOINT_STATE = (
@@ -173,11 +176,7 @@ def view_readings(message: Any) -> ViewReadings:
     InputError
         If arrays that belong together differ in length; `u` and `u_theta` may be empty.
     """
-    table = {name: np.array(getattr(message, name), dtype=kind)
-             for name, kind in (("m", np.int64), ("n", np.int64), ("dx", float), ("dy", float),
-                                ("count", np.int64), ("u", float), ("k", np.int64),
-                                ("dtheta", float), ("count_theta", np.int64),
-                                ("u_theta", float))}
+    table = {name: np.array(getattr(message, name), dtype=kind) for name, kind in COLUMNS}
     for *names, u in (("m", "n", "dx", "dy", "count", "u"),
                       ("k", "dtheta", "count_theta", "u_theta")):
         names += [u] * (len(table[u]) > 0)
@@ -187,9 +186,7 @@ def view_readings(message: Any) -> ViewReadings:
     return ViewReadings(
         view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
                 angular=bool(message.angular)),
-        m=table["m"], n=table["n"], dx=table["dx"], dy=table["dy"], count=table["count"],
-        u=table["u"], k=table["k"], dtheta=table["dtheta"], count_theta=table["count_theta"],
-        u_theta=table["u_theta"],
+        **table,
         sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
         used=int(message.detections_used), rejected=counts(message, "reject"),
@@ -213,16 +210,14 @@ def _visits_of(message: Any) -> GridVisits | None:
     """Return the visits in a ViewMeasurement; None if it has none."""
     if not len(getattr(message, "visit_mark", ())):
         return None
-    table = {name: np.array(getattr(message, f"visit_{field}"), dtype=kind)
-             for field, name, kind in _VISITS}
-    u = np.array(message.visit_u, dtype=float)
-    lengths = {len(column) for column in table.values()} | ({len(u)} if len(u) else set())
+    table = {name: np.array(getattr(message, f"visit_{name.removesuffix('_ns')}"), dtype=kind)
+             for name, kind in VISIT_COLUMNS}
+    lengths = {len(column) for name, column in table.items() if name != "u" or len(column)}
     if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
         raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
                          "the visits differ in length or name marks that were not read",
                          "correct the publisher")
-    return GridVisits(**table, u=u, sigma_m=float(message.sigma_visit),
-                      dof=int(message.dof_visit))
+    return GridVisits(**table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit))
 
 
 def counts(message: Any, prefix: str) -> dict[str, int]:

@@ -16,11 +16,14 @@ from selfcal_ros.model.view import View
 OUTLIER = "outlier_among_views"
 Key = tuple[int, str, tuple[int, ...]]
 """A reading: position of its view, ``grid`` or ``angular``, and (m, n) or (k,)."""
-_ARRAYS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
+COLUMNS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
            ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
-_VISITS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
-           ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"), ("approach_y", "i1"),
-           ("u", "f8"))
+"""Columns of `ViewReadings` with their types, named like their fields in ViewMeasurement."""
+VISIT_COLUMNS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
+                 ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"),
+                 ("approach_y", "i1"), ("u", "f8"))
+"""Columns of `GridVisits`; their fields in ViewMeasurement begin with visit_, that of stamp_ns is
+visit_stamp."""
 
 
 class Sense(StrEnum):
@@ -83,10 +86,9 @@ class GridVisits:
     def of_marks(self, keep: np.ndarray) -> "GridVisits":
         """Return the visits of the marks where `keep` (P,) is true, renumbered."""
         stay = keep[self.mark]
-        columns = {name: getattr(self, name)[stay] for name in (
-            "dx", "dy", "count", "stamp_ns", "offset_x", "offset_y", "approach_x", "approach_y")}
-        return replace(self, mark=(np.cumsum(keep) - 1)[self.mark[stay]], **columns,
-                       u=self.u[stay] if len(self.u) else self.u)
+        columns = {name: column[stay] for name, _ in VISIT_COLUMNS
+                   if len(column := getattr(self, name))}
+        return replace(self, **columns | {"mark": (np.cumsum(keep) - 1)[self.mark[stay]]})
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +318,7 @@ _KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
 
 def _digest(readings: ViewReadings) -> str:
     digest, visits = hashlib.sha256(), readings.visits
-    for table, columns in ((readings, _ARRAYS), *(((visits, _VISITS),) if visits else ())):
+    for table, columns in ((readings, COLUMNS), *(((visits, VISIT_COLUMNS),) if visits else ())):
         for name, kind in columns:
             digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
     if visits:
