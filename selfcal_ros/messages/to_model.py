@@ -176,7 +176,8 @@ def view_readings(message: Any) -> ViewReadings:
     InputError
         If arrays that belong together differ in length; `u` and `u_theta` may be empty.
     """
-    table = {name: np.array(getattr(message, name), dtype=kind) for name, kind in COLUMNS}
+    table: dict[str, Any] = {name: np.array(getattr(message, name), dtype=kind)
+                             for name, kind in COLUMNS}
     for *names, u in (("m", "n", "dx", "dy", "count", "u"),
                       ("k", "dtheta", "count_theta", "u_theta")):
         names += [u] * (len(table[u]) > 0)

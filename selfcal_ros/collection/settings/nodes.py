@@ -137,12 +137,10 @@ class SolverSettings(ManagedSettings):
     reference_u: float = declared(0.0, "standard uncertainty of that (k=1)", "m/m", 0.0, 0.09)
     reference_marks: str = declared(
         "", "kind marks: marks, distance, its u (m), M,N:M,N:LENGTH:U; of a list ID:ID:LENGTH:U")
-    reference_certificate: str = declared("", "certificate of the reference length: "
-                                         "number and issuer")
+    reference_certificate: str = declared("", "certificate of the known length: number, issuer")
     reference_at: str = declared(
-        "", "temperatures that move the certified length to that of the measurement, "
-        "T:U_T:ALPHA:U_ALPHA[:T0], e.g. 20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = "
-        "measured where it is used")
+        "", "temperatures that move that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], e.g. "
+        "20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = measured where it is used")
     model_terms: list[str] = declared(
         [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
         f"size is a standard deviation, SI; 0 = exactly zero; empty = those of the plan; "
