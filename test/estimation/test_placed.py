@@ -260,3 +260,14 @@ def test_a_map_of_too_many_nodes_says_that_their_number_was_not_tested(nodes, sa
     measurements, _ = readings(plate(23, nodes), THREE, np.random.default_rng(1))
     found = calibrate(measurements, Options(assumed=())).findings
     assert ("roughness_untested" in [finding.name for finding in found]) is said
+
+
+@pytest.mark.parametrize(("poses", "said"), [
+    (((0, (0, 0)), (5, (0, 0)), (0, (1, 0))), True),
+    (((0, (0, 0)), (5, (0, 0)), (0, (1, 0)), (90, (0, 0))), False)])
+def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, said):
+    """A finer map of 15 x 15 nodes has 450 unknowns, and three views 460 equations for it."""
+    measurements, _ = readings(plate(11, 9), poses, np.random.default_rng(5))
+    result = calibrate(measurements, Options())
+    assert ("roughness_untested" in [finding.name for finding in result.findings]) is said
+    assert (adequacy_of(fit_joint(measurements, Options())) is None) is said

@@ -60,6 +60,24 @@ def is_too_large(problem: Problem) -> bool:
         math.prod(system.grid.views.spline.refined.shape) > MAX_COEFFICIENTS)
 
 
+def equations_left(grid: PlacedSystem) -> int:
+    """Return the readings of a map beyond plate and misalignments: two numbers each."""
+    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (3 * grid.n_views - 7)
+
+
+def is_untested(problem: Problem) -> bool:
+    """Return whether no finer map can test the nodes of a map, if it has nodes of its own."""
+    system = problem.system
+    if not isinstance(system, PlacedEquations) or is_too_large(problem):
+        return isinstance(system, PlacedEquations)
+    views, left = system.grid.views, equations_left(system.grid)
+    if views.spline.axes[0].degree == 1 or left > 2 * math.prod(views.spline.refined.shape):
+        return False
+    fine = PlacedSystem(views.poses, system.grid.weight, views.spline.refined)
+    return left - told_coefficients(PlacedEquations(
+        fine, system.angular, system.grid_index, system.angular_index)) < 1
+
+
 def finer(model: ModelFit) -> ModelFit | None:
     """Return the fit of the same readings with a finer map, the coefficients as they are.
 
@@ -82,7 +100,7 @@ def finer(model: ModelFit) -> ModelFit | None:
 def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     """Return the fit of the same readings with another map and the same terms, in one step.
 
-    None on the lattice.
+    None on the lattice, or if the readings leave no noise by which to weight the terms.
     """
     problem, system = model.problem, model.problem.system
     if not isinstance(system, PlacedEquations):
@@ -94,7 +112,10 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     problem = replace(problem, system=other, places=None, residuals_xy=None,
                       conditions=replace(problem.conditions, slopes=flat))
     made = replace(model, problem=problem, found=fit(problem, model.y), reduced=None)
-    return made if model.equations is None else _with_terms(made, model.equations.columns)
+    if model.equations is None:
+        return made
+    weighted = np.isfinite(made.found.xy.sigma)
+    return _with_terms(made, model.equations.columns) if weighted else None
 
 
 def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:

@@ -19,7 +19,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
-from selfcal_ros.estimation.joint.finer import is_too_large
+from selfcal_ros.estimation.joint.finer import is_untested
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
@@ -239,8 +239,8 @@ def _axes_findings(solved: Solved) -> list[Finding]:
 
 
 def _untested(solved: Solved) -> list[Finding]:
-    """Return a finding if the map has too many nodes to test whether they suffice."""
-    untested = solved.model is not None and is_too_large(solved.model.problem)
+    """Return a finding if no finer map can test whether the nodes suffice."""
+    untested = solved.model is not None and is_untested(solved.model.problem)
     return [Finding("roughness_untested")] if untested else []
 
 

@@ -15,7 +15,12 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.joint.finer import is_too_large, told_coefficients, with_map
+from selfcal_ros.estimation.joint.finer import (
+    equations_left,
+    is_too_large,
+    told_coefficients,
+    with_map,
+)
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.placed import MapSpline
@@ -101,7 +106,10 @@ def adequacies_of(model: ModelFit) -> list[Adequacy]:
 
 
 def adequacy_of(model: ModelFit) -> Adequacy | None:
-    """Return the test of the map of a fit; None on the lattice, or for a map that is too large.
+    """Return the test of the map of a fit.
+
+    None on the lattice, for a map that is too large, or if the readings are too few for a finer
+    one.
 
     Parameters
     ----------
@@ -117,9 +125,11 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         return None
     fine, n = _of_marks(other), [told_coefficients(one) for one in (_of_marks(other), coarse)]
     before, rest = _squares(coarse, model.y), _squares(fine, other.y)
-    readings = 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (3 * grid.n_views - 7)
+    readings = equations_left(grid)
     more, dof, p = n[0] - n[1], readings - n[0], 1.0
-    power = np.zeros(2 * len(known_places(coarse)))
+    power, bilinear = np.zeros(2 * len(known_places(coarse))), grid.views.spline.axes[0].degree == 1
+    if dof < 1 and not bilinear:
+        return None
     if dof >= 1 and more >= 1:
         p = _improved(before, rest, more, dof)
         if p < 1.0:
@@ -127,7 +137,7 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
             power = _Further.of(fine, coarse, y).power(
                 max(float(np.sqrt(rest / dof)), NOISE_FREE_M))
         power = power + _of_terms(model, other) ** 2 * (p < ADEQUACY_LEVEL)
-    if grid.views.spline.axes[0].degree == 1 and before > readings * NOISE_FREE_M**2:
+    if bilinear and before > readings * NOISE_FREE_M**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
         if (other := with_map(model, smooth)) is not None:
             rest = max(_squares(_of_marks(other), other.y), NOISE_FREE_M * before)

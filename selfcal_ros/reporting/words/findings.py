@@ -202,8 +202,9 @@ SENTENCES: dict[str, Words] = {
     "no_uncertainty": lambda f, of: (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
     "roughness_untested": lambda f, of: (
-        "the map has too many nodes (more than 17 x 17): whether they suffice for the stage was "
-        "not tested, and U contains nothing for it; solve with fewer nodes once to see"),
+        "whether the nodes of the map suffice for the stage was not tested, and U contains nothing "
+        "for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the readings too few, "
+        "for a finer map; solve with fewer nodes once, or add a view"),
     "visited_once": lambda f, of: (
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
