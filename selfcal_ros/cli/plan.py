@@ -15,6 +15,7 @@ from selfcal_ros.cli.recheck import planned
 from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.normal.placed import KNOWN
 from selfcal_ros.estimation.observability.plan_budget import PlanBudget, plan_budget
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.prediction import Prediction
@@ -93,7 +94,8 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
     checks: Sequence[TermCheck] = ()
     budget: PlanBudget | None = None
     with busy("judging the plan"):
-        seen = check_plan(plan).observability
+        checked = check_plan(plan)
+        seen = checked.observability
         if seen.identifiable:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
@@ -101,7 +103,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             terms = (*model, *plan_terms.assumed_terms(args.model, model, plan))
             budget = plan_budget(plan, terms, assumed, alone, asked=[term.name for term in model])
     if args.json:
-        found = _check_json(plan, seen, alone, maps=args.map)
+        found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
             found["predicted"] |= {"rms_u_xy_um": alone.rms_xy * unit,
@@ -116,7 +118,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
         found["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
         print(json.dumps(found | {"terms": plan_terms.terms_json(checks)}, indent=1))
     else:
-        lines = _check_text(plan, seen, alone)
+        lines = _check_text(plan, (seen, checked.unknown_sites), alone)
         if alone is not None and args.sigma is not None:
             lines.append(_in_um("XY    ", alone, plan, assumed))
         if model and joint is not None:
@@ -152,11 +154,13 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
     return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
-def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *,
+def _check_json(plan: Plan, found: tuple[Observability, int], predicted: Prediction | None, *,
                 maps: bool) -> dict[str, Any]:
+    seen, unknown = found
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,
            "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None,
+           "unknown_sites": unknown if seen.identifiable else None,
            "unchecked_sites": seen.unchecked_sites, "unchecked_lines": seen.unchecked_lines}
     if predicted is not None:
         out["predicted"] = plain({
@@ -168,8 +172,9 @@ def _check_json(plan: Plan, seen: Observability, predicted: Prediction | None, *
     return out
 
 
-def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -> list[str]:
-    artifact = plan.artifact
+def _check_text(plan: Plan, found: tuple[Observability, int],
+                predicted: Prediction | None) -> list[str]:
+    artifact, (seen, unknown) = plan.artifact, found
     marks = (f"{artifact.shape[0]} x {artifact.shape[1]}" if artifact.marks is None else
              f"a list of {artifact.shape[0]}")
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
@@ -181,7 +186,7 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
         lines += [f"  - {text}" for text in seen.modes]
         lines += ["it would, if you"] + [f"  - {text}" for text in seen.advice]
         return lines
-    lines += ["the plan identifies the stage", *_unchecked_text(seen),
+    lines += [_known_text(plan, unknown), *_unchecked_text(seen),
               "predicted standard uncertainty, for unit noise of one averaged reading:",
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
     if len(predicted.u_theta):
@@ -189,6 +194,14 @@ def _check_text(plan: Plan, seen: Observability, predicted: Prediction | None) -
     note = field_note(predicted, plan)
     return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan),
             *([] if artifact.map_grid else [NODES_ONLY])]
+
+
+def _known_text(plan: Plan, unknown: int) -> str:
+    nodes = math.prod(plan.artifact.field.shape)
+    return "the plan identifies the stage" + (
+        f" at {nodes - unknown} of {nodes} nodes of the map: the other {unknown} stay unknown "
+        f"(standard uncertainty above {KNOWN:g} times the noise of a reading); add a view, or give "
+        "the map fewer nodes" if unknown else "")
 
 
 def _nodes_text(plan: Plan) -> list[str]:

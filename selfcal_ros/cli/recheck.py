@@ -38,6 +38,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     if args.json:
         print(json.dumps(plain({
             "plan_id": plan.plan_id, "identifiable": True, "artifact_from": plan.artifact_from,
+            "unknown_sites": found.map.n_unknown,
             "predicted": {"rms_gain_xy": found.map.rms_xy, "max_gain_xy": found.map.max_xy,
                           "rms_gain_theta": found.map.rms_theta,
                           "rms_gain_change": found.change}}), indent=1))
@@ -45,6 +46,8 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     tell("\n".join([
         f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate that "
         f"{plan.artifact_from} made known",
+        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the map stay unknown"]
+          if found.map.n_unknown else []),
         "predicted standard uncertainty, for unit noise of one averaged reading:",
         f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
         *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),

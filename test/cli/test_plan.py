@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -14,7 +15,7 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.cli.plan import field_note
 from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.estimation.observability.plan_check import predict_plan
-from selfcal_ros.files import read_yaml
+from selfcal_ros.files import read_json, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_from_dict
 
@@ -73,6 +74,28 @@ def test_check_in_words(capsys):
     text = capsys.readouterr().out
     assert "XY     rms 0.8905   largest 1.2154" in text and "theta  rms 0.6766" in text
     assert len(text.splitlines()[-1].split()) == 11
+
+
+def test_nodes_that_stay_unknown_are_counted(tmp_path, capsys):
+    """A turn of 5 deg determines 45 of 81 nodes: an independent dense solution says so as well."""
+    plan = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 0},
+            "map": {"grid_size": 9, "interpolation": "bicubic"},
+            "views": [{"name": "a"}, {"name": "b", "rotation_deg": 5},
+                      {"name": "c", "translation_pitch": [1, 0]}]}
+    (tmp_path / "plan.yaml").write_text(json.dumps(plan))
+    spec = {"plan": "plan.yaml", "seed": 5, "noise": {"sigma_xy": 2e-8}}
+    (tmp_path / "spec.yaml").write_text(json.dumps(spec))
+    path, bag, out = (str(tmp_path / name) for name in ("plan.yaml", "bag", "r.json"))
+    assert main(["plan", "check", path, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["unknown_sites"], found["deficiency"]) == (36, 0)
+    assert found["predicted"]["rms_gain_xy"] == pytest.approx(2.010, abs=1e-3)
+    assert main(["plan", "check", path]) == 0
+    assert "at 45 of 81 nodes of the map: the other 36 stay unknown" in capsys.readouterr().out
+    assert main(["simulate", str(tmp_path / "spec.yaml"), "-o", bag]) == 0
+    assert main(["solve", bag, "-o", out, "--model", "none"]) == 0
+    assert "Calibrated at 45 of 81 sites from 3 views" in capsys.readouterr().out
+    assert np.isnan(np.array(read_json(out)["error_map"]["gx"], dtype=float)).sum() == 36
 
 
 def test_check_judges_every_term(capsys):

@@ -117,6 +117,16 @@ def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
         wanted["rms_gain_change"], rel=1e-3)
 
 
+def test_nodes_that_a_shifted_plate_does_not_reach_are_counted(folder, capsys):
+    plan = {"plan_id": "beside", "artifact_from": "r.json",
+            "views": [{"name": "beside", "translation_pitch": [1, 0]}]}
+    (folder / "beside.yaml").write_text(json.dumps(plan))
+    assert main(["plan", "check", str(folder / "beside.yaml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["unknown_sites"] == 5
+    assert main(["plan", "check", str(folder / "beside.yaml")]) == 0
+    assert "\n5 of 25 nodes of the map stay unknown\n" in capsys.readouterr().out
+
+
 def test_plans_without_the_result_that_they_name(folder, tmp_path, capsys):
     """A plan that describes its plate loads without it."""
     path = tmp_path / "plan.yaml"

@@ -57,11 +57,14 @@ class PlanCheck:
         The unseen modes with an example map each.
     cures : tuple of tuple of View
         The smallest sets of views that would make the plan identify the stage.
+    unknown_sites : int
+        Sites, or nodes of the map, that remain unknown although the plan identifies the stage.
     """
 
     observability: Observability
     modes: tuple[UnseenMode, ...]
     cures: tuple[tuple[View, ...], ...] = ()
+    unknown_sites: int = 0
 
 
 @one_thread()
@@ -69,7 +72,10 @@ def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
     seen = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
-    return PlanCheck(seen, ()) if seen.identifiable else with_unseen_modes(seen, system, plan)
+    if not seen.identifiable:
+        return with_unseen_modes(seen, system, plan)
+    return PlanCheck(seen, (), unknown_sites=0 if plan.artifact.map_grid is None else int(
+        (~system.known_sites).sum()))
 
 
 def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:

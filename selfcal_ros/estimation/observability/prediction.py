@@ -50,6 +50,11 @@ class Prediction:
         return float(np.nanmax(np.stack([self.ux, self.uy])))
 
     @property
+    def n_unknown(self) -> int:
+        """Number of sites that remain unknown."""
+        return int(np.isnan(self.ux).sum())
+
+    @property
     def rms_theta(self) -> float:
         """Root mean square over the lines; NaN if no line is measured."""
         return rms(self.u_theta)

@@ -335,14 +335,16 @@ def state_sentence(result: CalibrationResult) -> str:
 
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
-    share = f" at {figures.n_known} of {figures.n_sites} sites"
+    share = (f" at {figures.n_known} of {figures.n_sites} sites"
+             if figures.n_known < figures.n_sites else "")
     views = counted_views([view for view in result.views if measured(view)])
-    text = f"Calibrated{share * (figures.n_known < figures.n_sites)} from {views}" + (
+    text = f"Calibrated{share} from {views}" + (
         " with a prior" if PRIOR in result.extra else "")
     if not figures.n_known:
         return text
     k = result.noise.k_xy
-    known = (f"every site known to ±{um(k * figures.max_u_m)} or better (k={k:.3g})"
+    which = "each" if share else "every site"
+    known = (f"{which} known to ±{um(k * figures.max_u_m)} or better (k={k:.3g})"
              if math.isfinite(figures.max_u_m) else "uncertainty not known")
     where = position_text(result.error_map, figures.max_site)
     return f"{text}: largest error {um(figures.max_error_m)} {where}, {known}"
