@@ -12,6 +12,8 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
+from selfcal_ros.estimation.datum.plate import BothCovariance
+from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
@@ -56,6 +58,9 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if is_flipped(result):
         rows = rows[:, ::-1, ::-1]
     cover = _exact_field(result, system).of(rows)
+    if (images := images_behind(result, system)) is not None:
+        nowhere = np.zeros((len(rows), *system.grid.views.plate_shape))
+        cover = cover + of_images(result, images, both_behind(result, system), (rows, nowhere))
     factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
     return _sized(cover + factors.T @ factors, u), True
 
@@ -168,6 +173,23 @@ def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCov
     if result.reference is not None:
         scale = scale_datum(system, ReferenceLength(**result.reference), length)
     return FieldCovariance(system, bounded_inverse(result, system), scale, result.noise.sigma_xy)
+
+
+def both_behind(result: CalibrationResult, system: NormalEquations) -> BothCovariance:
+    """Return the covariance of both maps for unit noise, without terms of the model."""
+    reference = None if result.reference is None else ReferenceLength(**result.reference)
+    return BothCovariance(system, bounded_inverse(result, system), reference,
+                          half_width_m=result.plate.grid_pitch_m * max(result.plate.reach),
+                          sigma_m=result.noise.sigma_xy)
+
+
+def of_images(result: CalibrationResult, images: ImageNoise, both: BothCovariance,
+              rows: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return what the noise of images adds to the covariance of functionals of both maps.
+
+    For unit noise; `rows` are the factors of the stage's map and those of the plate's.
+    """
+    return share_of(result) * images.added_covariance(both.sensitivities(*rows))
 
 
 def bounded_inverse(result: CalibrationResult, system: NormalEquations) -> np.ndarray:

@@ -14,18 +14,18 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import (
     MAX_LINES,
-    bounded_inverse,
+    both_behind,
     is_flipped,
+    of_images,
     system_behind,
     unit_rows,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.plate import BothCovariance
-from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
+from selfcal_ros.estimation.joint.images import ImageNoise, images_behind
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
 
@@ -64,10 +64,7 @@ class Together:
 
     @cached_property
     def _both(self) -> BothCovariance:
-        result, noise = self.result, self.result.noise
-        reference = None if result.reference is None else ReferenceLength(**result.reference)
-        return BothCovariance(self.system, bounded_inverse(result, self.system), reference,
-                              half_width_m=self.length_m, sigma_m=noise.sigma_xy)
+        return both_behind(self.result, self.system)
 
     @cached_property
     def _images(self) -> ImageNoise | None:
@@ -78,8 +75,7 @@ class Together:
         cover = self._both.of(sites, marks)
         if self._images is None:
             return cover
-        return cover + share_of(self.result) * self._images.added_covariance(
-            self._both.sensitivities(sites, marks))
+        return cover + of_images(self.result, self._images, self._both, (sites, marks))
 
     @cached_property
     def _effects(self) -> np.ndarray:

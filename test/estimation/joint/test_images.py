@@ -10,6 +10,7 @@ from scipy.stats import binom
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
@@ -110,6 +111,27 @@ def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     np.testing.assert_allclose(result.artifact_map.u_ax, u[::2].reshape(shape), rtol=1e-5)
     np.testing.assert_allclose(result.artifact_map.u_ay, u[1::2].reshape(shape), rtol=1e-5)
     assert u.mean() < 0.9 * np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T)).mean()
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(sense):
+    _, measurements = measured(3 * MARK, 5, missing=0.06, size=5, sense=sense)
+    matrix, stops = dense(measurements)
+    result = calibrate(measurements, ALONE)
+    camera = result.extra["camera"]
+    covariance = camera["noise_mark"]**2 * np.eye(len(matrix)) + camera["noise_image"]**2 * np.kron(
+        stops[:, None] == stops, np.eye(2))
+    gain = (datum(measurements.artifact) @ np.linalg.pinv(matrix, rcond=1e-10)[:50]).reshape(
+        5, 5, 2, -1)
+    if sense is Sense.PLATE_MOVES:
+        gain = -gain[::-1, ::-1]
+    known = result.error_map.valid.copy()
+    known[0, 1] = False
+    rows = np.concatenate([gain[known, 0], gain[known, 1]])
+    found, whole = xy_covariance(result, known)
+    wanted = rows @ covariance @ rows.T
+    assert whole and len(found) == 48
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * wanted.max())
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.06])
