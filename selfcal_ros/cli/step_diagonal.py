@@ -4,8 +4,8 @@
 import argparse
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from selfcal_ros import __version__
 from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
@@ -30,10 +30,6 @@ from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
 STEP_MM = 10.0
 SHORTEST_MM = 1e-6
 """Shorter steps, below 1 nm, are refused."""
-JOINTS = "x,y"
-REST_TOLERANCE_UM = 2.0
-MIN_REST_S = 0.5
-SETTLE_S = 0.1
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -129,9 +125,9 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 def _refuse_machine(args: argparse.Namespace) -> None:
     """Refuse options of a calibration file if none is written."""
-    refuse_given(args, {"x_axis": 1, "y_axis": 2, "unit": "mm", "home_x": None, "home_y": None,
-                        "reverse_x": False, "reverse_y": False, "force": False},
-                 "it belongs to a calibration file", "name one with --cal, or omit it")
+    refuse_given(args, ("x_axis", "y_axis", "unit", "home_x", "home_y", "reverse_x", "reverse_y",
+                        "force"), "it belongs to a calibration file",
+                 "name one with --cal, or omit it")
 
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
@@ -185,7 +181,9 @@ def _measurement(args: argparse.Namespace) -> tuple:
         if args.diagonals is not None:
             data = data.pick(_diagonals(args, data.dim))
     else:
-        refuse_for_table(args)
+        refuse_given(args, ("laser_topic", "laser_field", "laser_unit", "laser_sign",
+                            "position_topic", "joints", "rest_tolerance", "min_rest", "settle"),
+                     f"it is for bags, and {args.data} is a table", "omit it")
         dim = dimension_of(args.data)
         columns = Columns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
         data, warnings = read_table(args.data, columns)
@@ -230,30 +228,21 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
                        help="-1 if the distance decreases along the diagonals (default 1)")
     group.add_argument("--position-topic", metavar="TOPIC",
                        help="axis positions: JointState, PointStamped or PoseStamped, m")
-    group.add_argument("--joints", metavar="LIST", default=JOINTS,
+    group.add_argument("--joints", metavar="LIST", default="x,y",
                        help="joints of X, Y[, Z] (default x,y; three names mean 3D)")
-    group.add_argument("--rest-tolerance", type=float, default=REST_TOLERANCE_UM, metavar="UM",
+    group.add_argument("--rest-tolerance", type=float, default=2.0, metavar="UM",
                        help="largest motion of an axis at rest, um (default 2)")
-    group.add_argument("--min-rest", type=float, default=MIN_REST_S, metavar="S",
+    group.add_argument("--min-rest", type=float, default=0.5, metavar="S",
                        help="shortest rest, s (default 0.5)")
-    group.add_argument("--settle", type=float, default=SETTLE_S, metavar="S",
+    group.add_argument("--settle", type=float, default=0.1, metavar="S",
                        help="time ignored at both ends of a rest, s (default 0.1)")
     group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
 
 
-def refuse_for_table(args: argparse.Namespace) -> None:
-    """Refuse options of a bag if the readings come from a table."""
-    given = {"laser_topic": None, "laser_field": "", "laser_unit": "m", "laser_sign": 1,
-             "position_topic": None, "joints": JOINTS, "rest_tolerance": REST_TOLERANCE_UM,
-             "min_rest": MIN_REST_S, "settle": SETTLE_S}
-    refuse_given(args, given, f"it is for bags, and {args.data} is a table", "omit it")
-
-
-def refuse_given(args: argparse.Namespace, defaults: dict[str, Any], why: str,
-                 remedy: str) -> None:
+def refuse_given(args: argparse.Namespace, names: Sequence[str], why: str, remedy: str) -> None:
     """Refuse options that differ from their defaults, with the reason."""
-    for name, default in defaults.items():
-        if getattr(args, name) != default:
+    for name in names:
+        if getattr(args, name) != args.leaf.get_default(name):
             raise InputError(f"--{name.replace('_', '-')}", why, remedy)
 
 

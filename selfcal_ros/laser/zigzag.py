@@ -120,10 +120,9 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     NoDataError
         If it contains no complete run along a diagonal.
     InputError
-        If stamps do not ascend, a value is not finite, runs have different numbers of blocks, or a
-        reading is impossible.
+        If a value is not finite, runs have different numbers of blocks, or a reading is impossible.
     """
-    _check(series, rule)
+    _check(series)
     rests = find_rests(series, rule)
     moves = _moves(rests, rule)
     chains, notes = _chains(moves), []
@@ -160,25 +159,14 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
                {name: len(runs[name]) for name in sorted(runs)}, tuple(notes))
 
 
-def _check(series: Recording, rule: CutRule) -> None:
-    if series.position_m.ndim != 2 or series.position_m.shape[1] != len(rule.steps_m):
-        raise InputError("positions", f"{series.position_m.shape} where "
-                         f"{len(rule.steps_m)} axes are wanted", "name one joint for each step")
-    for name, stamps, values in (("laser", series.laser_ns, series.laser_m),
-                                 ("positions", series.position_ns, series.position_m)):
-        if len(stamps) == 0:
+def _check(series: Recording) -> None:
+    for name, values in (("laser", series.laser_m), ("positions", series.position_m)):
+        if len(values) == 0:
             raise NoDataError(name, "no samples", "check the topic")
-        if len(stamps) != len(values):
-            raise InputError(name, "stamps and values differ in number", "give one stamp a value")
-        if np.any(np.diff(stamps) < 0):
-            raise InputError(name, f"stamp {int(np.argmax(np.diff(stamps) < 0)) + 1} goes back in "
-                             "time", "sort the samples by their stamps")
-        bad = ~np.isfinite(values).reshape(len(stamps), -1).all(axis=1)
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
             raise InputError(name, f"sample {int(np.argmax(bad))} is not finite",
                              "leave lost samples out")
-    if rule.laser_sign not in (1, -1):
-        raise InputError("laser_sign", f"{rule.laser_sign} is not a sign", "give 1 or -1")
 
 
 def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
