@@ -7,13 +7,13 @@ import sys
 import numpy as np
 
 from selfcal_ros.apply import StageMap, load
-from selfcal_ros.cli.terminal import add_json, exit_code, say
-from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.cli.terminal import add_json
+from selfcal_ros.cli.trace import deliver, outputs_of
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import csv_cells, read_text
 from selfcal_ros.model.error_map import rms
-from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.outputs import check_outputs
 from selfcal_ros.units import UM_PER_M
 
 AXES = ("x", "y", "theta")
@@ -52,20 +52,13 @@ def run(args: argparse.Namespace) -> int:
         text, unknown, outside = distances(stage, points, inverse=args.inverse)
     else:
         text, unknown, outside = corrected(stage, points, inverse=args.inverse)
-    if args.output == "-":
-        say(args, text.removesuffix("\n"), {"csv": text})
-    else:
-        write_text(args.output, text)
-        record(args, stage.result, [args.output])
-        say(args, f"written: {args.output}, {len(points)} points",
-            {"written": args.output, "points": len(points), "unknown": unknown,
-             "outside": outside})
     _say_better(stage, points)
     for count, what in ((outside, "outside the field, corrected as the nearest point of its edge"),
                         (unknown, "next to unknown sites or lines, left empty")):
         if count:
             print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
-    return exit_code(stage.result)
+    return deliver(args, stage.result, text, "csv", note=f", {len(points)} points",
+                   points=len(points), unknown=unknown, outside=outside)
 
 
 def _say_better(stage: "StageMap", points: "np.ndarray") -> None:

@@ -15,16 +15,16 @@ from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
 from selfcal_ros.aerotech.read import load_cal, read_cal, refuse_errors
 from selfcal_ros.aerotech.rules import Gi4
 from selfcal_ros.aerotech.verify import controller_figure, plane_correction, setup_of, verify_tables
-from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
+from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
-from selfcal_ros.cli.trace import command, record, records_of
+from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.outputs import plain
 from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
@@ -206,15 +206,11 @@ def _export(args: argparse.Namespace) -> int:
         table = export.table_theta(result.error_map, frame)
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=export.theta_decimals(result.error_map))
-    check_outputs([args.result, args.onto], [*texts, *records_of(texts)])
-    refuse_existing(list(texts), force=args.force)
     lines, files = [], []
-    for path, text in texts.items():
-        backup = write_cal(path, text, force=args.force)
+    for path, backup in replace_files(args, texts, [args.result, args.onto], result).items():
         kind = "1D table for theta" if path != args.output else "2D table for x and y"
-        lines.append(f"{path}: {kind}" + (f"; the old file is {backup}" if backup else ""))
-        files.append({"file": path, "kind": kind, "old_file": backup and str(backup)})
-    record(args, result, texts)
+        lines.append(f"{path}: {kind}{replaced(backup)}")
+        files.append({"file": path, "kind": kind, "old_file": backup})
     say(args, "\n".join(lines), {"files": files, "filled": filled})
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
         print("selfcal cal: the theta table covers one turn either way and does not roll over;"

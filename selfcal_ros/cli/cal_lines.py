@@ -19,15 +19,14 @@ from selfcal_ros import __version__
 from selfcal_ros.aerotech import export as cal_lines
 from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
 from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
-from selfcal_ros.aerotech.write import cal_text, write_cal
+from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
-from selfcal_ros.cli.trace import command, outputs_of, record
+from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
 from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
@@ -279,13 +278,9 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
-        check_outputs([args.source], outputs_of(args))
-        backup = write_cal(args.output, text, force=args.force)
-        if result is not None:
-            record(args, result, [args.output])
-        say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}"
-            + (f"; the old file is {backup}" if backup else ""),
-            found | {"file": args.output, "old_file": backup and str(backup)})
+        backup = replace_files(args, {args.output: text}, [args.source], result)[args.output]
+        say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
+            found | {"file": args.output, "old_file": backup})
     else:
         say(args, text.removesuffix("\n"), found)
     return int(ExitCode.DONE) if result is None else exit_code(result)

@@ -3,10 +3,10 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
-from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.cli.terminal import add_json
+from selfcal_ros.cli.trace import deliver, outputs_of
 from selfcal_ros.files import read_yaml
-from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
 from selfcal_ros.standards.dcc import certificate, is_traceable
 from selfcal_ros.standards.details import details_from_dict
@@ -34,12 +34,6 @@ def run(args: argparse.Namespace) -> int:
     details = details_from_dict(read_yaml(args.details), args.details)
     xml = certificate(result, details, covariance=args.covariance,
                       not_qualified=args.not_qualified)
-    if args.output == STDOUT:
-        say(args, xml.decode().removesuffix("\n"), {"xml": xml.decode()})
-        return exit_code(result)
-    write_bytes(args.output, xml)
-    record(args, result, [args.output])
     traceable = is_traceable(result)
-    say(args, f"written: {args.output}, {'' if traceable else 'not '}traceable",
-        {"written": args.output, "traceable": traceable, "qualified": result.verdict.qualified})
-    return exit_code(result)
+    return deliver(args, result, xml, "xml", note=f", {'' if traceable else 'not '}traceable",
+                   traceable=traceable, qualified=result.verdict.qualified)

@@ -3,16 +3,14 @@
 
 import argparse
 
-from selfcal_ros.aerotech.write import refuse_existing, write_cal
 from selfcal_ros.cli.cal import figures_of, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.terminal import add_json, exit_code, say
-from selfcal_ros.cli.trace import command, record, records_of
+from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.controllers.export import FORMATS, export, loaded
 from selfcal_ros.controllers.grid import Source, Wiring
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
-from selfcal_ros.outputs import check_outputs
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,17 +47,12 @@ def run(args: argparse.Namespace) -> int:
     made = export(args.format, result, wiring, args.output, active=active, filled=filled,
                   command=command(args))
     say_bent(args, made.bent_m)
-    check_outputs([args.result, *(args.onto or ())], [*made.files, *records_of(made.files)])
-    refuse_existing(list(made.files), force=args.force)
-    backups = {path: write_cal(path, text, force=args.force) for path, text in made.files.items()}
-    record(args, result, made.files)
-    lines = [path + (f"; the old file is {backup}" if backup else "")
-             for path, backup in backups.items()]
+    backups = replace_files(args, made.files, [args.result, *(args.onto or ())], result)
+    lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:
         lines.append(residual_text(made.residuals))
     say(args, "\n".join(lines), {
-        "files": [{"file": path, "old_file": backup and str(backup)}
-                  for path, backup in backups.items()],
+        "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
         "filled": filled, "residuals": figures_of(made.residuals)})
     return exit_code(result)
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
-from selfcal_ros.cli.trace import command, outputs_of, record
+from selfcal_ros.cli.terminal import add_json
+from selfcal_ros.cli.trace import command, deliver, outputs_of
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
 from selfcal_ros.controllers.grid import Wiring, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
-from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.outputs import check_outputs
 from selfcal_ros.units import M_PER_UM
 
 
@@ -47,11 +47,5 @@ def run(args: argparse.Namespace) -> int:
         step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
     made = corrected_program(read_text(args.program), args.program, rewriter)
     program = commented(made.text, origin_lines(result, command(args)))
-    if args.output == STDOUT:
-        say(args, program.removesuffix("\n"), {"program": program})
-    else:
-        write_text(args.output, program)
-        record(args, result, [args.output])
-        say(args, f"written: {args.output}, {made.moves} moves as {made.pieces}", {
-            "written": args.output, "moves": made.moves, "pieces": made.pieces, "filled": filled})
-    return exit_code(result)
+    return deliver(args, result, program, "program", filled=filled, moves=made.moves,
+                   pieces=made.pieces, note=f", {made.moves} moves as {made.pieces}")

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
-from selfcal_ros.cli.trace import outputs_of, record
+from selfcal_ros.cli.terminal import STDOUT, add_json
+from selfcal_ros.cli.trace import deliver, outputs_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
 
 COLUMNS = ("m", "n", "x_m", "y_m", "gx_m", "gy_m", "u_gx_m", "u_gy_m",
@@ -41,14 +41,8 @@ def run(args: argparse.Namespace) -> int:
                          "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
     check_outputs([args.result], outputs_of(args))
     result = read_result(args.result)
-    if args.output == STDOUT:
-        text = csv_bytes(result).decode()
-        say(args, text.removesuffix("\n"), {"csv": text})
-        return exit_code(result)
-    write_bytes(args.output, csv_bytes(result) if kind == ".csv" else npz_bytes(result))
-    record(args, result, [args.output])
-    say(args, f"written: {args.output}", {"written": args.output, "kind": kind.lstrip(".")})
-    return exit_code(result)
+    content = csv_bytes(result) if kind == ".csv" else npz_bytes(result)
+    return deliver(args, result, content, "csv", kind=kind.lstrip("."))
 
 
 def csv_bytes(result: "CalibrationResult") -> bytes:

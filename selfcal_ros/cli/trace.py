@@ -8,17 +8,18 @@ import argparse
 import hashlib
 import os
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from selfcal_ros import __version__
-from selfcal_ros.cli.terminal import STDOUT, add_json, say
+from selfcal_ros.aerotech.write import refuse_existing, write_cal
+from selfcal_ros.cli.terminal import STDOUT, add_json, exit_code, say
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import parse_json, read_bytes, sha256_of
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.outputs import write_json
+from selfcal_ros.outputs import check_outputs, write_bytes, write_json
 from selfcal_ros.results import attachments, bag_files, result_bytes
 
 SCHEMA = "selfcal.origin/1"
@@ -57,6 +58,58 @@ def record(args: argparse.Namespace, result: "CalibrationResult",
                            "plan_id": result.plan_id, "run_id": result.run_id},
                 "created": datetime.now(UTC).isoformat(timespec="seconds"),
                 "command": command(args), "version": __version__})
+
+
+def deliver(args: argparse.Namespace, result: CalibrationResult, content: str | bytes, key: str, *,
+            note: str = "", **data: Any) -> int:
+    """Write what is made of a result to its file with a record, or to stdout; return the exit code.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Arguments with ``output``.
+    result : CalibrationResult
+        The result; if it is not qualified, the code is 5 and the reason on stderr.
+    content : str or bytes
+        Content of the file.
+    key : str
+        Key of the content in the JSON of ``--json``, if it goes to stdout.
+    note : str
+        Follows the name of the file that was written.
+    **data
+        More JSON on the file.
+    """
+    raw = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+    if args.output == STDOUT:
+        text = raw.decode()
+        say(args, text.removesuffix("\n"), {key: text})
+    else:
+        write_bytes(args.output, raw)
+        record(args, result, [args.output])
+        say(args, f"written: {args.output}{note}", {"written": args.output, **data})
+    return exit_code(result)
+
+
+def replace_files(args: argparse.Namespace, texts: Mapping[str, str], sources: Iterable[str | None],
+                  result: CalibrationResult | None = None) -> dict[str, str | None]:
+    """Write files with their records, keep those that they replace; return path -> the old one.
+
+    Raises
+    ------
+    InputError
+        If one of them is a source, cannot be written, or exists and ``--force`` is not given.
+    """
+    check_outputs(sources, [*texts, *records_of(texts)])
+    refuse_existing(list(texts), force=args.force)
+    backups = {path: write_cal(path, text, force=args.force) for path, text in texts.items()}
+    if result is not None:
+        record(args, result, texts)
+    return {path: str(backup) if backup else None for path, backup in backups.items()}
+
+
+def replaced(backup: str | None) -> str:
+    """Return a note on the old file, empty if there was none."""
+    return f"; the old file is {backup}" if backup else ""
 
 
 def command(args: argparse.Namespace) -> str:
