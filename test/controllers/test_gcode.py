@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corrected programs: their words, and the path of a stage that runs them."""
 
-import math
 import random
 import re
 from dataclasses import replace
@@ -16,6 +15,7 @@ from selfcal_ros.controllers.grid import Wiring, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from test.support.maps import random_map
+from test.support.programs import farthest, run_program
 
 MAP = random_map(Artifact(11, 0.01), 4, gain=20.0)  # errors of some 5 um, from site to site
 FRAME = MachineFrame(unit="m", home_x_m=-0.03, home_y_m=0.005)
@@ -83,71 +83,10 @@ def corrected(text: str, error_map=MAP, frame=FRAME, *, um=1.0, decimals=6, **kw
     return corrected_program(text, "a.nc", rewriter).text
 
 
-def run_program(text: str) -> list[tuple[str, np.ndarray]]:
-    """Return (motion, points in m) of each move in XY: a slow interpreter, apart from the code."""
-    unit, absolute, motion, at, moves = 1e-3, True, "", np.full(2, np.nan), []
-    for line in text.splitlines():
-        line = re.sub(r"\(.*?\)|;.*", "", line).upper()
-        if re.match(r"\s*(\$|[A-Z_]{2}|M117|G28|G92)", line):
-            continue
-        words = [(c, float(v)) for c, v in re.findall(r"([A-Z])\s*([-+.\d]+)", line)]
-        for letter, value in words:
-            if letter == "G":
-                unit = {20: 0.0254, 21: 1e-3}.get(value, unit)
-                absolute = {90: True, 91: False}.get(value, absolute)
-                motion = f"{value:g}" if value in (0, 1, 2, 3, 80, 81) else motion
-        w = dict(words)
-        arc = motion in ("2", "3") and set("IJ") & set(w)
-        if not set("XY") & set(w) and not arc:
-            continue
-        end = np.array([w[c] * unit + (0 if absolute else old) if c in w else old
-                        for c, old in zip("XY", at, strict=True)])
-        points = [end]
-        if motion == "1" and np.isfinite(at).all():
-            points = np.linspace(at, end, 4 + int(np.hypot(*(end - at)) / 3e-4))
-        elif motion in ("2", "3"):
-            points = arc_points(at, end, w, unit, clockwise=motion == "2")
-        moves.append((motion, np.array(points)))
-        at = end
-    return moves
-
-
-def arc_points(start, end, w, unit, *, clockwise):
-    """Points of an arc by complex numbers: z = centre + (start - centre) e^(i angle)."""
-    a, b = complex(*start), complex(*end)
-    if "R" in w:
-        r = w["R"] * unit
-        rise = math.sqrt(max(r * r - abs(b - a) ** 2 / 4, 0))
-        left = 1j * (b - a) / abs(b - a)  # to the left of the way
-        # counter-clockwise, up to half a turn: the centre lies to the left
-        side = (1 if not clockwise else -1) * (1 if r > 0 else -1)
-        centre = (a + b) / 2 + side * rise * left
-    else:
-        centre = a + complex(w.get("I", 0), w.get("J", 0)) * unit
-    turn = np.angle((b - centre) / (a - centre))
-    if clockwise and turn >= -1e-12:
-        turn -= 2 * np.pi
-    if not clockwise and turn <= 1e-12:
-        turn += 2 * np.pi
-    z = centre + (a - centre) * np.exp(1j * turn * np.linspace(0, 1, 1500))
-    return np.stack([z.real, z.imag], axis=1)
-
-
 def true_path(points: np.ndarray, error_map=MAP, frame=FRAME) -> np.ndarray:
     """Return where the stage really goes when these positions are commanded."""
     x, y = Compensator(error_map).correct(*frame.from_machine(*points.T))
     return np.stack(frame.to_machine(x, y), axis=1)
-
-
-def farthest(points: np.ndarray, path: np.ndarray) -> float:
-    """Return the largest distance of points from a path through many points."""
-    path = np.concatenate([path, path[-1:]])  # it may be one point
-    a, b = path[:-1], path[1:]
-    d = b - a
-    length2 = np.maximum((d**2).sum(axis=1), 1e-30)
-    t = np.clip(((points[:, None] - a) * d).sum(axis=2) / length2, 0, 1)
-    off = a + t[:, :, None] * d - points[:, None]
-    return float(np.hypot(off[..., 0], off[..., 1]).min(axis=1).max())
 
 
 def check_path(text: str, out: str, tolerance: float, **machine) -> int:
