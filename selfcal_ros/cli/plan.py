@@ -36,14 +36,15 @@ from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
 from selfcal_ros.model.view import Plan, parse_order
 from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.reporting.words.tables import plan_budget_text, search_text, step_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 SHOWN = 8
 """Default number of suggestions."""
 
-NODES_ONLY = ("readings at the nodes of the map only: to test what lies between them, give the map "
-              "nodes of its own (map:), and a view shifted by half a pitch")
+NODES_ONLY = ("every reading lies at a node of the map: to test what happens between nodes, give "
+              "the map nodes of its own (map:) and add a view shifted by half a pitch")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -178,22 +179,29 @@ def _check_text(plan: Plan, found: tuple[Observability, int],
     marks = (f"{artifact.shape[0]} x {artifact.shape[1]}" if artifact.marks is None else
              f"a list of {artifact.shape[0]}")
     lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
-             f"{artifact.angular_count} angular lines",
+             f"{artifact.angular_count or 'no'} angular lines",
              *_nodes_text(plan), *_image_text(plan),
-             f"rank {seen.rank} of {seen.unknowns} unknowns, {seen.deficiency} unseen modes"]
+             _rank_text(seen)]
     if predicted is None or not seen.identifiable:
-        lines += ["the plan does not identify the stage; unseen are:"]
+        lines += ["the plan does not identify the stage: it cannot see"]
         lines += [f"  - {text}" for text in seen.modes]
-        lines += ["it would, if you"] + [f"  - {text}" for text in seen.advice]
-        return lines
+        return lines + ["to see all of it,"] + [f"  - {text}" for text in seen.advice]
     lines += [_known_text(plan, unknown), *_unchecked_text(seen),
-              "predicted standard uncertainty, for unit noise of one averaged reading:",
+              "predicted standard uncertainty, in units of the noise of one averaged reading:",
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
     return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan),
             *([] if artifact.map_grid else [NODES_ONLY])]
+
+
+def _rank_text(seen: Observability) -> str:
+    """Return rank and unseen modes; the rank is that of the marks, without the lines."""
+    lines = seen.deficiency - (seen.unknowns - seen.rank)
+    modes = counted(seen.deficiency, "unseen mode") if seen.deficiency else "no unseen modes"
+    return (f"rank {seen.rank} of {seen.unknowns} unknowns, {modes}"
+            + (f", {lines} of them in the angular map" if lines else ""))
 
 
 def _known_text(plan: Plan, unknown: int) -> str:
@@ -223,8 +231,8 @@ def _check_stops_text(plan: Plan) -> str:
     if not marks and plan_terms.tells_camera(plan):
         return "no check stops: images show scale, turn, distortion and sign of the camera"
     if not marks:
-        return ("no check stops: only stop errors and turns of the plate show scale, turn and sign "
-                "of the microscope; add check_stops: {marks: 5, offset: 20e-6}")
+        return ("no check stops: scale, turn and sign of the microscope show only where the stage "
+                "happens to stop beside a mark; add check_stops: {marks: 5, offset: 20e-6}")
     return (f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
             f"and y: {4 * marks} more exposures")
 
@@ -232,7 +240,7 @@ def _check_stops_text(plan: Plan) -> str:
 def _unchecked_text(seen: Observability) -> list[str]:
     counts = ((seen.unchecked_sites, "sites"), (seen.unchecked_lines, "lines"))
     found = " and ".join(f"{count} {what}" for count, what in counts if count)
-    return [f"{found} depend on single readings that no other reading checks: a further view would "
+    return [f"{found} depend on single readings that no other reading checks: another view would "
             "check them"] if found else []
 
 
@@ -332,7 +340,7 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
         return
     tell("\n".join([
         f"plan {plan.plan_id}: {_score_text(*now)}",
-        f"next steps, the best first by {args.criterion} XY uncertainty:",
+        f"next steps, best first ({args.criterion} uncertainty of XY):",
         *(f"  {_score_text(item.score, unit)}   {step_text(item, plan)}" for item in ranked)]))
 
 
@@ -343,7 +351,7 @@ def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float |
         print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
                           "how": how, **_score_json(*score)}, indent=1))
         return
-    tell(f"best plan of {len(views)} views by {args.criterion} XY uncertainty ({how}):")
+    tell(f"best plan of {len(views)} views ({args.criterion} uncertainty of XY; {how}):")
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
@@ -365,7 +373,7 @@ def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
 
 def _score_text(score: Score, noise_m: float | None) -> str:
     if score.deficiency:
-        return f"{score.deficiency} modes unseen"
+        return counted(score.deficiency, "unseen mode")
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
     if noise_m is not None:
         unit = noise_m * UM_PER_M

@@ -192,8 +192,8 @@ def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
 
 def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> list[str]:
     """Return the checks of terms as a table, with the assumptions."""
-    lines = ["terms: separable from the stage or not; effect on the map of this size outside the "
-             "model;", "probability of detection",
+    lines = ["terms: whether the readings separate them from the stage, what a term of this size",
+             "does to the map if it is left out of the model, and how likely it is to be detected",
              f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
              f"{'largest':>10} {'detected':>9}"]
     for c in checks:

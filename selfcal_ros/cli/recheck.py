@@ -18,7 +18,7 @@ from selfcal_ros.results import read_result
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("plate_from", metavar="RESULT.json",
-                        help="calibration that made the plate known")
+                        help="calibration of the plate")
     solve.configure(parser)
 
 
@@ -28,10 +28,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def planned(args: argparse.Namespace, plan: "Plan") -> int:
-    """Print what views of a known plate will tell; for `selfcal plan check`."""
+    """Print what views of a known plate will show; for `selfcal plan check`."""
     if args.plan_verb == "suggest":
-        raise InputError(args.plan, "its plate is known: any view that reads all marks will do",
-                         "check the plan")
+        raise InputError(args.plan, "its plate is already calibrated: any view that reads all "
+                         "marks will do", "use selfcal plan check")
     plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
         found = predict_recheck(plan, plate)
@@ -44,12 +44,12 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
                           "rms_gain_change": found.change}}), indent=1))
         return int(ExitCode.DONE)
     tell("\n".join([
-        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate that "
-        f"{plan.artifact_from} made known",
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate calibrated in "
+        f"{plan.artifact_from}",
         *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the map stay unknown"]
           if found.map.n_unknown else []),
-        "predicted standard uncertainty, for unit noise of one averaged reading:",
+        "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
         *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
-        f"  change of XY since then: rms {found.change:.4f}"]))
+        f"  change of XY since the calibration: rms {found.change:.4f}"]))
     return int(ExitCode.DONE)

@@ -147,9 +147,9 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     if problem.terms:
         free = " or ".join(str(term.name) for term in problem.terms if math.isinf(term.size))
         raise NotSettledError(f"model {', '.join(str(term.name) for term in problem.terms)}",
-                              "the estimate does not settle",
+                              "the fit does not converge",
                               "leave a term out" + (f", or give {free} a size" if free else ""))
-    raise NotSettledError("misalignment model 'rigid'", "the rotations do not settle",
+    raise NotSettledError("misalignment model 'rigid'", "the rotations do not converge",
                           "check the readings for misalignments of more than a few degrees")
 
 

@@ -219,12 +219,13 @@ def describe_view(view: View, artifact: Artifact) -> str:
     elif 1e-6 < turn < 360 - 1e-6:
         what = f"a view turned by {turn:.6g} deg"
     else:
-        what = "a view without turn"
+        what = "an unturned view"
     unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
     steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
     shifted = [f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True)
                if step]
-    return what + (" and shifted by " + " and ".join(shifted) if shifted else "")
+    also = " shifted by " if what.startswith("an unturned") else " and shifted by "
+    return what + (also + " and ".join(shifted) if shifted else "")
 
 
 def describe_views(views: Iterable[View], artifact: Artifact) -> list[str]:

@@ -92,8 +92,8 @@ def loose_family(system: NormalEquations) -> UnseenMode | None:
     modes = system.loose_modes
     if not len(modes):
         return None
-    return UnseenMode("undetermined fields", f"{len(modes)} fields with a standard uncertainty "
-                      "beyond ten readings' noise", as_map(modes[0]))
+    return UnseenMode("undetermined fields", f"{len(modes)} fields whose standard uncertainty "
+                      "exceeds ten times the noise of a reading", as_map(modes[0]))
 
 
 def component_family(system: NormalEquations) -> UnseenMode | None:
@@ -119,7 +119,7 @@ def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
     shifts = {(pose.a, pose.b) for pose in grid.views.poses}
     turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
     if len(grid.views.poses) == 1:
-        return "every field", "every field: one view cannot separate the stage from the plate"
+        return "every field", "everything: one view cannot separate the stage from the plate"
     for axis, line in ((0, "rows"), (1, "columns")):
         first = np.take(label, [label.shape[axis] // 2], axis=axis)
         if (label == first).all():
@@ -135,8 +135,8 @@ def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
         along = " and ".join(f"every {p} pitches along {a}"
                              for p, a in zip(period, "xy", strict=True) if p > 1)
         return "periodic fields", f"patterns that repeat {along} ({2 * n} numbers)"
-    return ("separate groups of sites", f"{n} groups of sites that no reading joins to the others: "
-            f"each may move by itself, the smallest is {_smallest(grid, label)}")
+    return ("separate groups of sites", f"{n} groups of sites that no reading connects: "
+            f"each may move by itself; the smallest is {_smallest(grid, label)}")
 
 
 def _period(label: np.ndarray) -> tuple[int, int] | None:
@@ -167,7 +167,7 @@ def unvisited_family(grid: GridSystem) -> UnseenMode | None:
     if not missing.any():
         return None
     at = np.argwhere(missing)[0] - np.array(grid.views.half)
-    return UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark visits, "
+    return UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark reaches, "
                       f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
 
 
@@ -193,8 +193,8 @@ def angular_families(system: NormalEquations) -> list[UnseenMode]:
         out.append(UnseenMode("angular groups", _angular_text(parts, n), np.zeros((0,))))
     missing = int((parts.of_site < 0).sum())
     if missing:
-        out.append(UnseenMode("lines never visited", f"{missing} stage angles that no line "
-                              "visits", np.zeros((0,))))
+        out.append(UnseenMode("lines never visited", f"{missing} angles of the stage that no line "
+                              "reaches", np.zeros((0,))))
     return out
 
 
@@ -214,9 +214,9 @@ def _angular_text(parts: Components, n: int) -> str:
     lines = np.arange(len(parts.of_site))
     if np.array_equal(parts.of_site, parts.of_site[lines % n]):
         if n == len(lines):
-            return "angular map: every field, as no view turns the lines"
+            return "angular map: everything, as no view turns the lines"
         return f"angular map: patterns that repeat every {n} lines"
-    return f"angular map: {n} groups of lines that no view joins"
+    return f"angular map: {n} groups of lines that no view connects"
 
 
 def as_map(field: np.ndarray) -> np.ndarray:

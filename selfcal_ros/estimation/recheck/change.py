@@ -86,17 +86,17 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
         If it is not qualified, or does not have what the plate's covariance needs.
     """
     if "recheck" in result.extra:
-        raise InputError(where, "a recheck itself: it has no plate of its own",
-                         f"name the calibration it was made with, {result.extra['recheck']['of']}")
+        raise InputError(where, "is itself a recheck, which calibrates no plate",
+                         f"name the calibration that it used, {result.extra['recheck']['of']}")
     if not result.observability.identifiable or not result.verdict.qualified:
-        raise InputError(where, "its readings contradict the model: its plate is not known",
-                         "calibrate anew")
+        raise InputError(where, "is not qualified, so its plate is not known",
+                         "calibrate again")
     result = measured_alone(result)
     kept = together(result)
     if kept is None:
-        raise InputError(where, "the covariance of its plate is not kept",
-                         "calibrate jointly, with the uncertainty, a plate of at most 31 x 31 "
-                         "marks")
+        raise InputError(where, "does not contain the covariance of its plate",
+                         "calibrate with the method joint and with uncertainty; a plate may have "
+                         "31 x 31 marks at most")
     return KnownPlate(result, kept, where)
 
 
@@ -112,8 +112,7 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     if (mine.shape, mine.angular_count, mine.marks) != (
             other.shape, other.angular_count, other.marks) or abs(
             mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
-        raise InputError(plate.where, f"its plate has {_said(other)}, the one that was read "
-                         f"{_said(mine)}", "name the result of this plate")
+        raise InputError(plate.where, f"its plate has {_said(other)}, not {_said(mine)}", "name the calibration of that plate")
     if mine.map_grid is None and other.map_grid is not None:
         mine = replace(mine, map_grid=other.map_grid)
     if not mine.harmonics:
@@ -124,9 +123,9 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
 def _said(artifact: Artifact) -> str:
     nx, ny = artifact.shape
     if artifact.marks:
-        return f"a list of {nx} marks and {artifact.angular_count} lines"
+        return f"a list of {nx} marks and {artifact.angular_count or 'no'} lines"
     return (f"{nx} x {ny} marks {artifact.grid_pitch_m * MM_PER_M:g} mm apart and "
-            f"{artifact.angular_count} lines")
+            f"{artifact.angular_count or 'no'} lines")
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +235,8 @@ def map_change(new: NewMap, plate: KnownPlate) -> Change:
     rows, sites, there = _on_nodes(new.artifact, plate)
     common = new.known & there
     if common.sum() < 3:
-        raise InputError(plate.where, f"{int(common.sum())} nodes are known in both maps",
-                         "measure where the map was known")
+        raise InputError(plate.where, f"only {int(common.sum())} nodes are known in both maps",
+                         "measure where its map is known")
     here, w = np.tile(common.ravel(), 2), rows[common.ravel()]
     both = np.kron(np.eye(2), w)
     values = new.xy.reshape(-1)[here] - both @ np.concatenate([old.gx[sites], old.gy[sites]])

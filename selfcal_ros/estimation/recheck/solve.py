@@ -114,8 +114,8 @@ class Rechecked:
 def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
     """Return what `recheck` makes its result of."""
     if options.method != "joint" or options.reference is not None:
-        raise InputError("options", "a recheck has the method joint, and the reference length of "
-                         "the plate's calibration", "leave them out")
+        raise InputError("options", "a recheck always uses the method joint and the reference "
+                         "length of the plate's calibration", "leave both out")
     readings = plate_readings(on_plate(measurements, plate), options, plate)
     xy, theta = _noise(readings, plate)
     new, seen = _new_map(readings, plate, xy, options)
@@ -218,8 +218,8 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
         visits=visits, assumed=options.finite_rotations) if term.name is not TermName.ROTATION)
     for term in terms:
         if term.free:
-            raise InputError("model_terms", f"the term '{term.name}' has no size, and views of a "
-                             "known plate do not tell it", f"give it one, {term.name}:SIZE")
+            raise InputError("model_terms", f"views of a known plate cannot determine the term "
+                             f"'{term.name}'", f"give it a size, {term.name}:SIZE")
     return terms
 
 

@@ -82,8 +82,8 @@ def least_squares(design: np.ndarray, noise: np.ndarray, held: np.ndarray,
     try:
         root = np.linalg.cholesky(noise)
     except np.linalg.LinAlgError as error:
-        raise InputError("readings", "they, or those of the calibration, have no noise to compare "
-                         "a change with", "use measured ones") from error
+        raise InputError("readings", "they or those of the calibration have no noise against which "
+                         "to judge a change", "use measured readings") from error
     white = solve_triangular(root, design, lower=True)
     normal = white.T @ white
     size = np.trace(normal) / len(normal)
@@ -313,7 +313,7 @@ def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: n
             told = round(float(np.einsum("ij,ji->", gain.rows, design)))
             return Seen(known, field, found[2 * n:], gain, right - design @ found,
                         len(right) - told)
-    raise NotSettledError("recheck", "the rotations of the plate do not settle",
+    raise NotSettledError("recheck", "the rotations of the plate do not converge",
                           "check the readings for misalignments of more than a few degrees")
 
 

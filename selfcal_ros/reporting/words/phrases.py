@@ -77,8 +77,8 @@ def excluded_text(line: BudgetLine) -> str:
 
 STILL_GOOD = "Still good"
 CHANGED = "Changed"
-ONE_PASS = ("one pass does not tell a change from drift: two passes do (repeats: 2, visit_order: "
-            "there_and_back)")
+ONE_PASS = ("a single pass cannot tell a change from drift, two passes can (repeats: 2, "
+            "visit_order: there_and_back)")
 
 
 def recheck_sentence(found: Mapping[str, Any]) -> str:
@@ -92,8 +92,9 @@ def recheck_sentence(found: Mapping[str, Any]) -> str:
     since, scale = printable(os.path.basename(str(found["of"]))), found.get("scale", {})
     if found["changed"]:
         drift = f"; {ONE_PASS}" * (found.get("passes") == 1)
-        return (f"{CHANGED} since {since}: calibrate anew, if it is the same plate, clean and "
-                f"placed as planned; {_largest(found['largest'])} (p = {found['p']:.2g}){drift}")
+        return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
+                f"clean and placed as planned; {_largest(found['largest'])} "
+                f"(p = {found['p']:.2g}){drift}")
     if scale.get("changed"):
         return (f"{_scale_changed(since, scale['change'], scale['u'], scale['p'])}; otherwise no "
                 f"change beyond its uncertainty (p = {found['p']:.2g}); "
@@ -104,8 +105,8 @@ def recheck_sentence(found: Mapping[str, Any]) -> str:
 
 def _scale_changed(since: str, change: float, u: float, p: float) -> str:
     return (f"Scale changed since {since} by {change * UM_PER_M:+.3g} ± {u * UM_PER_M:.2g} µm/m "
-            f"(k=1, p = {p:.2g}): the temperature of the plate or the encoders, one plate does not "
-            "tell which")
+            f"(k=1, p = {p:.2g}): the temperature of the plate or of the encoders has changed, one "
+            "plate cannot tell which")
 
 
 def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
@@ -119,13 +120,14 @@ def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
     since = printable(os.path.basename(str(of["of"])))
     return (f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
             f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
-            "u, each by itself, as no stage does: check which plate it is, that it is clean and "
-            "lies as planned; if it has changed, calibrate anew")
+            "u, and neighbouring marks have nothing in common, unlike the errors of a stage: check "
+            "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
+            "again")
 
 
 def _largest(of: Mapping[str, Any]) -> str:
     at = f"x = {of['x'] * MM_PER_M:.6g}, y = {of['y'] * MM_PER_M:.6g} mm"
-    return (f"most at {at}, by {of['change'] * UM_PER_M:+.3f} ± {of['u'] * UM_PER_M:.3f} µm along "
+    return (f"clearest at {at}: {of['change'] * UM_PER_M:+.3f} ± {of['u'] * UM_PER_M:.3f} µm along "
             f"{of['axis']} (k=1)")
 
 
@@ -136,11 +138,11 @@ def recheck_lines(found: Mapping[str, Any]) -> list[str]:
            f"u {found['u_rms'] * UM_PER_M:.5f} µm, p = {found['p_xy']:.2g}"]
     if "detectable" in found:
         sizes = {name: f"{size * UM_PER_M:.2g} µm" for name, size in found["detectable"].items()}
-        out.append(f"found  in 9 of 10 cases: {sizes['one_node']} at one node, or a smooth change "
-                   f"of {sizes['smooth']} rms per axis")
+        out.append(f"detectable in 9 of 10 cases: {sizes['one_node']} at one node, or a smooth "
+                   f"change of {sizes['smooth']} rms per axis")
     if "p_theta" in found:
         line = found["largest_theta"]
-        out.append(f"theta  most at line {line['line']}, by "
+        out.append(f"theta  clearest at line {line['line']}: "
                    f"{line['change'] * ARCSEC_PER_RAD:+.4f} ± {line['u'] * ARCSEC_PER_RAD:.4f} "
                    f"arcsec (k=1), p = {found['p_theta']:.2g}")
     if found.get("passes") == 1:

@@ -128,7 +128,7 @@ def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
         if lines:
             whole, noise = (2 * factor * budget.u_rms(quantity, noise_only=only)
                             for only in (False, True))
-            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; without what is assumed "
+            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone "
                        f"{noise:.3g} {unit}")
     return out
 
@@ -153,7 +153,7 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
     """
     if step.view is None and not step.order:
         return (f"add check_stops: {{marks: {plan_check.CHECK_MARKS}, "
-                f"offset: {plan_check.CHECK_OFFSET_M:g}}}")
+                f"offset: {plan_check.CHECK_OFFSET_M * UM_PER_M:g}e-6}}")
     if step.view is None:
         pairs = {(old.repeats, new.repeats)
                  for old, new in zip(plan.views, step.views, strict=True)}

@@ -71,11 +71,11 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shar
 
 
 @pytest.mark.parametrize(("terms", "message"), [
-    ("", "misalignment model 'rigid': the rotations do not settle; check the readings for "
+    ("", "misalignment model 'rigid': the rotations do not converge; check the readings for "
      "misalignments of more than a few degrees"),
-    ("plate_scale,drift:1e-8", "model drift, plate_scale: the estimate does not settle; leave a "
+    ("plate_scale,drift:1e-8", "model drift, plate_scale: the fit does not converge; leave a "
      "term out, or give plate_scale a size"),
-    ("plate_scale:1e-7,drift:1e-8", "model drift, plate_scale: the estimate does not settle; leave "
+    ("plate_scale:1e-7,drift:1e-8", "model drift, plate_scale: the fit does not converge; leave "
      "a term out")])
 def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     monkeypatch.setattr(model_fit, "MAX_STEPS", 1)

@@ -127,8 +127,8 @@ def test_groups_that_no_reading_joins_are_counted_and_the_smallest_is_named():
     plan = plan_of("0, tx2", 5, size_y=3)
     family = next(mode for mode in unseen_modes(planned_system(plan.artifact, plan.views))
                   if mode.name == "separate groups of sites")
-    assert family.text == ("6 groups of sites that no reading joins to the others: each may move "
-                           "by itself, the smallest is (-1, -1), (1, -1)")
+    assert family.text == ("6 groups of sites that no reading connects: each may move by itself; "
+                           "the smallest is (-1, -1), (1, -1)")
 
 
 def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_difference():
@@ -175,9 +175,9 @@ def test_unseen_modes_in_words():
 
 
 @pytest.mark.parametrize(("views", "first"), [
-    ("0, 90", "add a view without turn and shifted by +1 pitch along X"),
+    ("0, 90", "add an unturned view shifted by +1 pitch along X"),
     ("0, tx, ty", "add a view turned by 90 deg"),
-    ("0", "add a view turned by 90 deg and a view without turn and shifted by +1 pitch along X"),
+    ("0", "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X"),
 ])
 def test_advice_names_the_missing_view(views, first):
     assert check_plan(plan_of(views)).observability.advice[0] == first

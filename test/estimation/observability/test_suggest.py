@@ -94,7 +94,7 @@ def test_next_views_are_ranked_by_what_they_give():
     values = [item.score.rms_xy for item in ranked]
     assert np.all(np.diff(np.round(values, 8)) >= 0)
     by_text = {step_text(item, plan): item.score for item in ranked}
-    added = by_text["add a view without turn and shifted by +1 pitch along Y"]
+    added = by_text["add an unturned view shifted by +1 pitch along Y"]
     assert added.rms_xy == pytest.approx(0.660, abs=5e-4)
     assert by_text["add a view turned by 180 deg"].rms_xy == pytest.approx(0.763, abs=5e-4)
     line = by_text["add an angular view turned by 1 line (15 deg)"]
@@ -220,7 +220,7 @@ def test_bent_plates_ask_for_a_shift_the_other_way():
     # by noise alone a shift along y is as good
     assert set(shifts(alone[:3])) == {(-1, 0), (0, 1), (0, -1)}
     by_text = {step_text(item, plan): item.score.rms_xy for item in ranked}
-    back, on = (by_text[f"add a view without turn and shifted by {a} pitch along X"]
+    back, on = (by_text[f"add an unturned view shifted by {a} pitch along X"]
                 for a in ("-1", "+1"))
     assert back < 0.7 * on
     # a plate's shape does not ask in which order it is visited

@@ -111,7 +111,7 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
 
     def without_first(kept, options):
         if not len(kept.views[0].m):
-            raise NotSettledError("model drift", "the estimate does not settle", "leave it out")
+            raise NotSettledError("model drift", "the fit does not converge", "leave it out")
         return solve(kept, options)
     monkeypatch.setattr(validation, "solve_joint", without_first)
     found = validate(readings, BARE, folds=1)

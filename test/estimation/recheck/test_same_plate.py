@@ -96,7 +96,7 @@ def test_a_bent_stage_and_a_few_marks_are_not_another_plate(size):
                  few):
         result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent), BARE, plate))
         assert result.extra["recheck"]["changed"]
-        assert result.verdict.sentence.startswith("Changed since r.json: calibrate anew, if it is")
+        assert result.verdict.sentence.startswith("Changed since r.json: calibrate again, provided")
 
 
 def test_a_scale_that_has_changed_is_the_headline():
@@ -109,7 +109,7 @@ def test_a_scale_that_has_changed_is_the_headline():
         assert found["scale"]["changed"] and not found["changed"]
         assert abs(abs(found["scale"]["change"]) - 5e-6) < 3 * found["scale"]["u"]
         assert result.verdict.sentence.startswith("Scale changed since r.json by ")
-        assert "temperature of the plate or the encoders" in result.warnings[0]
+        assert "temperature of the plate or of the encoders" in result.warnings[0]
         assert result.verdict.grade is Grade.GOOD
     same = worded(recheck(once_more(Sense.MICROSCOPE_MOVES), BARE, plate))
     assert same.verdict.sentence.startswith("Still good") and not same.warnings
@@ -123,7 +123,7 @@ def test_one_pass_does_not_tell_drift_from_a_change():
     two = replace(one, views=(replace(seen, view=replace(seen.view, repeats=2)),))
     for readings, told in ((one, True), (two, False)):
         result = worded(recheck(readings, BARE, plate))
-        assert ("one pass does not tell a change from drift" in result.warnings[0]) is told
+        assert ("a single pass cannot tell a change from drift" in result.warnings[0]) is told
 
 
 def test_a_view_off_the_lattice_that_lies_a_quarter_turn_on():
