@@ -112,7 +112,8 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     if (mine.shape, mine.angular_count, mine.marks) != (
             other.shape, other.angular_count, other.marks) or abs(
             mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
-        raise InputError(plate.where, f"its plate has {_said(other)}, not {_said(mine)}", "name the calibration of that plate")
+        raise InputError(plate.where, f"its plate has {_said(other)}, not {_said(mine)}",
+                         "name the calibration of that plate")
     if mine.map_grid is None and other.map_grid is not None:
         mine = replace(mine, map_grid=other.map_grid)
     if not mine.harmonics:
