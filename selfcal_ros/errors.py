@@ -111,13 +111,14 @@ def as_answer(error: Exception) -> tuple[ExitCode, str]:
     return ExitCode.INTERNAL, printable(f"{type(error).__name__}: {error}")
 
 
-def printable(text: str) -> str:
+def printable(text: object) -> str:
     r"""Return `text` as one line without control characters.
 
     Names in bags, plans and messages come from outside: an escape sequence, a line break or a
     change of the writing direction in them is shown as ``\x1b``, ``\n``, ``\u202e``. A text that
     is too long is shortened to its beginning, length and end.
     """
+    text = str(text)
     if len(text) > sum(SHOWN):
         text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"
     if text.isprintable():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ThetaDatum
@@ -39,7 +40,6 @@ from selfcal_ros.reporting.summary.numbers import (
     aligned_numbers,
     camera_facts,
     fixed_column,
-    printable,
     significant,
 )
 from selfcal_ros.reporting.summary.sections import Section

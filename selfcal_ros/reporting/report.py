@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import write_bytes, write_text
 from selfcal_ros.reporting.chapters import Chapter, Figure, chapters, heading
 from selfcal_ros.reporting.figures import drawing as draw
-from selfcal_ros.reporting.summary.numbers import numeric_columns, printable, truth_arrays
+from selfcal_ros.reporting.summary.numbers import numeric_columns, truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
 
 FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.errors import printable
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.result import CalibrationResult, ViewResult
@@ -17,7 +18,7 @@ from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
 from selfcal_ros.reporting.figures.residuals import places_mm
-from selfcal_ros.reporting.summary.numbers import cells_of, printable, significant, yaw_of
+from selfcal_ros.reporting.summary.numbers import cells_of, significant, yaw_of
 from selfcal_ros.reporting.summary.sections import pose_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 

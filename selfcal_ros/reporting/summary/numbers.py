@@ -36,11 +36,6 @@ def can_print_symbols(stream: TextIO) -> bool:
     return True
 
 
-def printable(text: object) -> str:
-    """Return `text` as one line without control characters, which could steer a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in str(text))
-
-
 def significant(value: float, digits: int = 3) -> str:
     """Return `value` with `digits` significant digits; scientific only far from 1.
 

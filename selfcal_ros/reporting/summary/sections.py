@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
@@ -28,7 +28,6 @@ from selfcal_ros.reporting.summary.numbers import (
     fixed_column,
     map_figures,
     numeric_columns,
-    printable,
     significant,
     to_ascii,
     truth_figures,

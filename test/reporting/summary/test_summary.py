@@ -167,7 +167,7 @@ def test_names_cannot_steer_the_terminal():
                       rejected={"r\x1b": 1})
     text = summary_text(hostile)
     assert all(char.isprintable() or char == "\n" for char in text)
-    assert "a?[2J?b" in text and "p?q" in text
+    assert r"a\x1b[2J\nb" in text and r"p\rq" in text
 
 
 def test_a_verdict_comes_before_everything_else():
