@@ -6,7 +6,7 @@ straightens offsets between them; its degree is the smallest that the cells do n
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,9 +17,12 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName
+from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.view import View
 
 DEGREE_LEVEL = 1e-3
 """Level of the test that a polynomial of a higher degree fits the cells better."""
@@ -29,6 +32,15 @@ cubic ones look like linear ones in three cells."""
 
 UNREAD = 1e-6
 """Size of a column, or of its part in a combination, that is none."""
+
+MOST_U = 5.0
+"""Largest uncertainty of the offset in a cell of a view, over their median; others are too few."""
+
+FEW = 0.5
+"""Part of the images in which the mark of a cell was read, below which its readings are few."""
+
+IN_LINE = 3e-3
+"""Least part of a polynomial that places must show, of that of its largest part."""
 
 STEPS = 20
 """Steps from a published offset to the true one; each is shorter by the slope of the distortion."""
@@ -65,9 +77,13 @@ class Camera(Distortion):
 
     Attributes
     ----------
+    image : Image
+        All cells.
+    cells : sequence of tuple
+        Those whose error is known, in their order.
     place, error : complex array (cells,)
-        Mean true offset in each cell, stage axes, and the error there relative to that on the
-        optical axis, m.
+        Mean true offset in each known cell, stage axes, and the error there relative to that on
+        the optical axis, m.
     u : float array (cells, 2)
         Standard uncertainties of the errors along x and y, m.
     u_coefficients : float array (1 + powers, 2)
@@ -76,6 +92,8 @@ class Camera(Distortion):
         Noise shared by the marks of an image, and that of a mark, m.
     """
 
+    image: Image
+    cells: Sequence[tuple[int, int]]
     place: np.ndarray
     error: np.ndarray
     u: np.ndarray
@@ -93,6 +111,9 @@ class Camera(Distortion):
         """Return the JSON form, ``camera`` in RESULT.json."""
         scale, shear = self.coefficients[1:3]
         u_scale, u_turn = self.u_coefficients[1]
+        known = {cell: {"x": z.real, "y": z.imag, "dx": e.real, "dy": e.imag, "u_dx": u[0],
+                        "u_dy": u[1]} for cell, z, e, u in zip(
+            self.cells, self.place, self.error, self.u, strict=True)}
         return {
             "scale": scale.real, "rotation": scale.imag, "stretch": shear.real,
             "shear": shear.imag, "u_scale": u_scale, "u_rotation": u_turn,
@@ -102,10 +123,13 @@ class Camera(Distortion):
                 {"power": list(power), "x": value.real, "y": value.imag, "u_x": u[0], "u_y": u[1]}
                 for power, value, u in zip(self.powers, self.coefficients[1:],
                                            self.u_coefficients[1:], strict=True)],
-            "cells": [{"x": z.real, "y": z.imag, "dx": e.real, "dy": e.imag, "u_dx": u[0],
-                       "u_dy": u[1]} for z, e, u in zip(self.place, self.error, self.u,
-                                                        strict=True)],
+            "cells": [known.get(cell, self._unknown(cell)) for cell in self.image.cells],
             "noise_image": self.noise_image, "noise_mark": self.noise_mark}
+
+    def _unknown(self, cell: tuple[int, int]) -> dict[str, Any]:
+        """Return the JSON form of a cell whose error is not known, at its nominal place."""
+        place = complex(*cell) * self.image.pitch_m
+        return {"x": place.real, "y": place.imag, **dict.fromkeys(("dx", "dy", "u_dx", "u_dy"))}
 
 
 def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
@@ -114,44 +138,77 @@ def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
 
 
 def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
-    """Return the camera that a fit shows; None if cells are missing, or lie in one line."""
+    """Return the camera that a fit shows; None if its cells are too few, or lie in one line.
+
+    A cell that one view lacks has the error that the others show, as they differ between cells.
+    """
     images = model.problem.images
     if images is None:
         return None
     problem, grid = model.problem, model.problem.system.grid
-    views = [measurements.views[index].view for index in problem.grid.index]
-    image = views[0].image
+    readings = [measurements.views[index] for index in problem.grid.index]
+    image = readings[0].view.image
     if image is None or min(image.nx, image.ny) < 3:
         return None
-    cells = image.cells
-    names = list(dict.fromkeys(view.plan_view for view in views))
-    order = {(view.plan_view, view.cell): row for row, view in enumerate(views)}
-    if any((name, cell) not in order for name in names for cell in cells):
-        return None
-    rows = np.array([[order[name, cell] for cell in cells] for name in names])
-    middle = cells.index((0, 0))
     turn = grid.views.phases * np.exp(1j * problem.turn_rad)
 
-    def errors(parameters: np.ndarray) -> np.ndarray:
-        """Return the errors of the cells for misalignments (..., size)."""
-        offset = turn * (parameters[..., 1:3 * grid.n_views:3]
-                         + 1j * parameters[..., 2:3 * grid.n_views:3])
-        of_cell = offset[..., rows]
-        return (of_cell - of_cell[..., middle, None]).mean(axis=-2)
+    def offsets(parameters: np.ndarray) -> np.ndarray:
+        """Return the offsets of the sub-views for misalignments (..., size)."""
+        return turn * (parameters[..., 1:3 * grid.n_views:3]
+                       + 1j * parameters[..., 2:3 * grid.n_views:3])
 
     noises = images.noises(model.found.residuals)
-    found = errors(model.found.parameters)
-    drawn = errors(images.parameters)
+    drawn = offsets(images.parameters)
+    spread = np.std(noises.mark * drawn[:, 0] + noises.image * drawn[:, 1], axis=0)
+    seen = (grid.read.sum(axis=(1, 2)) > 1) & (spread <= MOST_U * np.median(spread))
+    layout = _layout([one.view for one in readings], image, seen)
+    if layout is None:
+        return None
+    cells, rows, errors = layout
+    found, drawn = errors(offsets(model.found.parameters)), errors(drawn)
     samples = noises.mark * drawn[:, 0] + noises.image * drawn[:, 1]
-    readings = [measurements.views[index] for index in problem.grid.index]
-    published = np.array([_place([readings[row] for row in column]) for column in rows.T])
+    published = np.array([_place([readings[row] for row in column[column >= 0]])
+                          for column in rows.T])
+    if not _determined(published, POWERS[1]):
+        return None
     error = found
     for _ in range(STEPS):  # from the optical axis on, not from the offsets in its cell
         powers, fit = _polynomial(published - error, found, samples)
         error = found - (fit @ found)[0]
-    spread = samples @ fit.T
-    return Camera(powers, fit @ error, published - error, error, _spread(
-        samples - spread[:, :1]), _spread(spread), noises.image, noises.mark)
+    moved = samples @ fit.T
+    return Camera(powers, fit @ error, image, cells, published - error, error, _spread(
+        samples - moved[:, :1]), _spread(moved), noises.image, noises.mark)
+
+
+Layout = tuple[list[tuple[int, int]], np.ndarray, Callable[[np.ndarray], np.ndarray]]
+"""Cells, the sub-view of each view in each of them, int array (names, cells), -1 for none, and a
+function from offsets (..., views) to those of cells relative to the one nearest the axis."""
+
+
+def _layout(views: Sequence[View], image: Image, seen: np.ndarray) -> Layout | None:
+    """Return how offsets of sub-views, those `seen`, depend on view and cell.
+
+    A gap has the value that the least squares of both effects give it, so that means over the
+    views are the estimates. None if the views do not connect the cells.
+    """
+    at = {(views[row].plan_view, views[row].cell): row for row in np.flatnonzero(seen).tolist()}
+    names = list(dict.fromkeys(name for name, _ in at))
+    cells = [cell for cell in image.cells if any((name, cell) in at for name in names)]
+    rows = np.array([[at.get((name, cell), -1) for cell in cells] for name in names])
+    effects = np.concatenate([np.repeat(np.eye(len(names)), len(cells), axis=0),
+                              np.tile(np.eye(len(cells)), (len(names), 1))], axis=1)
+    known = rows >= 0
+    if np.linalg.matrix_rank(effects[known.ravel()]) < len(names) + len(cells) - 1:
+        return None
+    gaps = effects[~known.ravel()] @ np.linalg.pinv(effects[known.ravel()])
+    middle = min(range(len(cells)), key=lambda index: abs(complex(*cells[index])))
+
+    def errors(offset: np.ndarray) -> np.ndarray:
+        of_cell = offset[..., rows]
+        of_cell[..., ~known] = of_cell[..., known] @ gaps.T
+        return (of_cell - of_cell[..., middle, None]).mean(axis=-2)
+
+    return cells, rows, errors
 
 
 def _spread(samples: np.ndarray) -> np.ndarray:
@@ -169,6 +226,8 @@ def _polynomial(place: np.ndarray, error: np.ndarray,
     fit = _fitted(place, powers)
     for degree in (3, 2):
         more = (*powers, *POWERS[degree])
+        if not _determined(place, more):
+            continue
         wider = _fitted(place, more)
         added = (wider @ error)[len(powers) + 1:]
         drawn = (samples @ wider.T)[:, len(powers) + 1:]
@@ -184,7 +243,18 @@ def _fitted(place: np.ndarray, powers: Powers) -> np.ndarray:
     """Return the least-squares matrix from errors at the cells to coefficients, complex."""
     scale = float(np.abs(place).max())
     unit = np.array([1.0, *(scale**(a + b) for a, b in powers)])
-    return np.linalg.pinv(_terms(place / scale, powers)) / unit[:, None]
+    return np.linalg.pinv(_unit_terms(place, powers)) / unit[:, None]
+
+
+def _unit_terms(place: np.ndarray, powers: Powers) -> np.ndarray:
+    """Return 1 and the powers of places, the farthest at 1."""
+    return _terms(place / float(np.abs(place).max()), powers)
+
+
+def _determined(place: np.ndarray, powers: Powers) -> bool:
+    """Return whether a polynomial follows from its values at places, not all near one line."""
+    sizes = np.linalg.svd(_unit_terms(place, powers), compute_uv=False)
+    return bool(len(sizes) > len(powers) and sizes[-1] > IN_LINE * sizes[0])
 
 
 def _place(views: Sequence[ViewReadings]) -> complex:
@@ -197,10 +267,9 @@ def _place(views: Sequence[ViewReadings]) -> complex:
 def straightened(measurements: Measurements, camera: Distortion) -> Measurements:
     """Return the readings with the camera's error in each cell that of its mean offset.
 
-    Or that of its nominal place, if the camera was found from other readings.
+    Or that of its nominal place, if the camera was found from other readings, or without the cell.
     """
-    image = next(view.view.image for view in measurements.views if view.view.image)
-    places = dict(zip(image.cells, camera.place + camera.error, strict=True)) if isinstance(
+    places = dict(zip(camera.cells, camera.place + camera.error, strict=True)) if isinstance(
         camera, Camera) else {}
     return replace(measurements, views=tuple(
         view if view.view.cell is None or view.visits is None
@@ -233,6 +302,43 @@ def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
     return replace(view, dx=view.dx - dx, dy=view.dy - dy, visits=replace(
         visits, dx=visits.dx - excess.real, dy=visits.dy - excess.imag,
         offset_x=visits.offset_x - excess.real, offset_y=visits.offset_y - excess.imag))
+
+
+def few_read(measurements: Measurements, camera: Camera | None) -> tuple[Finding, ...]:
+    """Return a finding on the cells of images whose mark is missing in most images.
+
+    Those of all views together, or of one.
+    """
+    few = []
+    counts = _read_and_shown(measurements) if measurements.has_images else {}
+    for cell in dict.fromkeys(cell for _, cell in counts):
+        of_views = {name: count for (name, at), count in counts.items() if at == cell}
+        total = np.sum(list(of_views.values()), axis=0)
+        few += [(name, cell, count) for name, count in (
+            [("", total)] if total[0] < FEW * total[1] else of_views.items())
+            if count[0] < FEW * count[1]]
+    if not few:
+        return ()
+    unknown = None if camera is None else [
+        list(cell) for cell in camera.image.cells if cell not in camera.cells]
+    return (Finding("few_read", details={"unknown": unknown, "cells": [
+        {"view": name, "cell": list(cell), "read": int(read), "shown": int(shown)}
+        for name, cell, (read, shown) in few]}),)
+
+
+def _read_and_shown(measurements: Measurements
+                    ) -> dict[tuple[str, tuple[int, int]], tuple[int, int]]:
+    """Return for views and cells how many marks were read, and how many the images showed."""
+    stops: dict[str, set[tuple[int, int]]] = {}
+    parts = [(one.view.plan_view, one.view.cell, one.view.step_on_plate(measurements.artifact), one)
+             for one in measurements.views if one.view.cell is not None]
+    for name, _, (m, n), one in parts:
+        stops.setdefault(name, set()).update(zip((one.m - m).tolist(), (one.n - n).tolist(),
+                                             strict=True))
+    hx, hy = measurements.artifact.half
+    return {(name, cell): (len(one.m), sum(abs(i + m) <= hx and abs(j + n) <= hy
+                                           for i, j in stops[name]))
+            for name, cell, (m, n), one in parts}
 
 
 @dataclass(frozen=True, eq=False)

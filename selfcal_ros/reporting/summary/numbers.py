@@ -333,10 +333,11 @@ TURNS = 1e-3
 
 
 def cells_of(result: CalibrationResult) -> np.ndarray:
-    """Return places, errors and their u at the cells of images, (6, cells), m; empty without."""
+    """Return places, errors and u at the known cells of images, (6, cells), m; empty without."""
     camera: Any = result.extra.get("camera")
     try:
-        cells = np.array([[float(cell[name]) for name in COLUMNS] for cell in camera["cells"]]).T
+        cells = np.array([[float(cell[name]) for name in COLUMNS] for cell in camera["cells"]
+                          if cell["dx"] is not None]).T
         known = all(isinstance(camera[name], int | float) for name in NUMBERS)
     except (KeyError, TypeError, ValueError):
         return np.zeros((len(COLUMNS), 0))

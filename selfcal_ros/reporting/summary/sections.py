@@ -34,7 +34,7 @@ from selfcal_ros.reporting.summary.numbers import (
     um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
-from selfcal_ros.reporting.words.phrases import counted_views, excluded_text
+from selfcal_ros.reporting.words.phrases import counted_views, excluded_text, of_few_read
 from selfcal_ros.reporting.words.tables import dof_text
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
@@ -336,7 +336,7 @@ def state_sentence(result: CalibrationResult) -> str:
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = (f" at {figures.n_known} of {figures.n_sites} sites"
              if figures.n_known < figures.n_sites else "")
-    views = counted_views([view for view in result.views if measured(view)])
+    views = counted_views(result.views, measured) + of_few_read(result.findings)
     text = f"Calibrated{share} from {views}" + (
         " with a prior" if PRIOR in result.extra else "")
     if not figures.n_known:

@@ -214,6 +214,7 @@ SENTENCES: dict[str, Words] = {
         f"{f.size * UM_PER_M:.3g} µm and a correlation length of {of['length_m'] * MM_PER_M:.3g} "
         f"mm, as the readings show; by these alone u would be {of['u_rms_without'] * UM_PER_M:.3g} "
         f"instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)"),
+    "few_read": phrases.few_read_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (
         f"the plate is {_either(f, 'larger', 'smaller')} than the encoders indicate by "

@@ -2,12 +2,12 @@
 """Phrases for the lines of an uncertainty budget, the result of a recheck, and counts of views."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
-from selfcal_ros.model.pose import without_cell
+from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
@@ -21,12 +21,38 @@ OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
 """How a line of the budget was found, given the file of the plate."""
 
 
-def counted_views(views: Sequence[ViewResult]) -> str:
-    """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are no views."""
-    number = len({without_cell(view.name) for view in views})
+def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
+    """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are no views.
+
+    Of the views in which a cell is one `of` those meant.
+    """
+    number = len({without_cell(view.name) for view in views if of(view)})
     cells = len({view.name.removeprefix(without_cell(view.name)) for view in views} - {""})
     images = f" with images of {cells} marks" if cells else ""
     return f"{number} view{'s' * (number != 1)}{images}"
+
+
+def few_read_text(found: Finding, of: dict[str, Any]) -> str:
+    """Return the sentence on cells of images with few readings."""
+    where = " and ".join(
+        f"in cell {cell_label(one['cell'])} of the images"
+        f"{f' of view {one['view']!r}' * bool(one['view'])} ({one['read']} of {one['shown']})"
+        for one in of["cells"])
+    unknown = "the camera's error could not be determined" if of["unknown"] is None else (
+        f"the camera's error is not known in {_named(of['unknown'])}")
+    return (f"few marks were read {where}: look for dirt or a shadow in what the camera sees there"
+            + (f"; {unknown}" if of["unknown"] != [] else ""))
+
+
+def _named(cells: Sequence[Any]) -> str:
+    return f"cell{'s' * (len(cells) > 1)} {', '.join(map(cell_label, cells))}"
+
+
+def of_few_read(findings: Sequence[Finding]) -> str:
+    """Return what the first sentence on a result says of cells with few readings."""
+    cells = list(dict.fromkeys(tuple(one["cell"]) for found in findings if found.name == "few_read"
+                               for one in found.details.get("cells", [])))
+    return f", few of them read in {_named(cells)}" if cells else ""
 
 
 def line_text(line: BudgetLine) -> str:
