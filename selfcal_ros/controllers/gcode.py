@@ -158,7 +158,7 @@ class Rewriter:
             self._at |= {a: values[a] for a in OTHERS if a in values and "92" in codes}
             return [text]
         arc = self._motion in ("2", "3")
-        if not {"X", "Y"} & set(values) and not (arc and {"I", "J"} & set(values)):
+        if not set("XY" if not arc else AXES + "IJR") & set(values):
             self._at |= self._ends(values)
             return ["".join(_as_line(w).text for w in words)] if arc else [text]
         return self._moved(words, values, where)
@@ -246,7 +246,7 @@ class Rewriter:
         cx, cy = self._correct(path[:, 0], path[:, 1])
         path = path + np.stack([cx, cy], axis=1)
         kept = simplified(path, (1 - OF_SAMPLES) * self._tolerance_m)[1:]
-        share = kept / (len(path) - 1) if len(path) > 1 else np.ones(1)
+        share = kept / (len(path) - 1)
         lines = self._lines(words, values, path[kept] / self._unit_m, share, where)
         self._at |= {"X": end[0], "Y": end[1]} | self._ends(values)
         if self._motion.startswith("38"):  # a probe may stop before its end
@@ -260,7 +260,7 @@ class Rewriter:
         """Return points of the programmed path, (P, 2); of a rapid the end alone."""
         if self._motion in ("2", "3"):
             return self._arc(np.array(start), np.array(end), values, where)
-        if self._motion == "1" and math.isfinite(start[0] + start[1]):
+        if self._motion == "1" and math.isfinite(start[0]):
             count = math.ceil(math.dist(start, end) / self._step_m)
             return np.linspace(start, end, _few(count, where) + 1)
         return np.array([end, end])
@@ -271,6 +271,10 @@ class Rewriter:
             raise InputError(where, "the arc is not one turn in the XY plane from a known point",
                              "correct the program without it")
         unit, sense = self._unit_m, -1 if self._motion == "2" else 1
+        given = set("IJR") & set(values)
+        if not given or (self._centre_absolute and given in ({"I"}, {"J"})):
+            raise InputError(where, "G90.1 needs I and J" if given else "the arc has no I, J or R",
+                             "give its centre, or begin a line with G1")
         if "R" in values:
             chord, radius = end - start, values["R"] * unit
             half = float(np.hypot(*chord)) / 2
@@ -287,7 +291,7 @@ class Rewriter:
             raise InputError(where, "the ends of the arc are not equally far from its centre",
                              "check I, J, X, Y")
         sweep = sense * ((sense * (a1 - a0)) % (2 * math.pi))
-        if abs(sweep) < 1e-9 or abs(abs(sweep) - 2 * math.pi) < 1e-9:
+        if abs(sweep) < 1e-9:
             sweep = sense * 2 * math.pi
         limit = min(1.0, OF_SAMPLES * self._tolerance_m / r0)
         count = abs(sweep) / min(2 * math.acos(1 - limit), self._step_m / r0)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Corrected G-code whose coordinates are worked out by hand."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
+
+
+class Looked:
+    """A correction by hand, and the points at which it is looked up, in mm."""
+
+    def __init__(self, correct=lambda x, y: (0 * x, 0 * y)):
+        self._correct, self.points = correct, []
+
+    def __call__(self, x_m, y_m):
+        self.points.append(np.stack([x_m, y_m], axis=1) * 1e3)
+        return tuple(np.asarray(c) * 1e-3 for c in self._correct(x_m * 1e3, y_m * 1e3))
+
+
+def roof(top):
+    """Return a correction of y by 0.1 mm at x = top, 0 at x = 0 and twice the way."""
+    return Looked(lambda x, y: (0 * x, 0.1 * (1 - abs(x - top) / top)))
+
+
+def rewritten(text, correct=None, *, tolerance=1e-3, step=1.0, **kwargs):
+    """Return the lines of a corrected program; tolerance and step in mm."""
+    rewriter = Rewriter(correct or Looked(), tolerance_m=tolerance * 1e-3, step_m=step * 1e-3,
+                        **kwargs)
+    return corrected_program(text, "a.nc", rewriter).text.splitlines()
+
+
+def values(lines, letter):
+    return [float(v) for line in lines for v in re.findall(rf"{letter}([-.\d]+)", line)]
+
+
+def places(lines):
+    return np.stack([values(lines, "X"), values(lines, "Y")], axis=1)
+
+
+@pytest.mark.parametrize(("arc", "centre", "first"), [
+    ("G2 J-5", (0, -5), (1, -1)), ("G3 J-5", (0, -5), (-1, -1)),
+    ("G2 I5", (5, 0), (1, 1)), ("G3 I5", (5, 0), (1, -1)), ("G3 I-5 F100", (-5, 0), (-1, 1))])
+def test_a_circle_with_one_word_for_its_centre(arc, centre, first):
+    """From (0, 0); `first` are the signs of the way at its beginning."""
+    points = places(rewritten(f"G0 X0 Y0\n{arc}\n", tolerance=0.01)[1:])
+    np.testing.assert_allclose(np.hypot(*(points - centre).T), 5, atol=1e-5)
+    assert tuple(np.sign(points[0])) == first and tuple(points[-1]) == (0, 0)
+    angle = np.unwrap(np.arctan2(*(np.vstack([[0, 0], points]) - centre).T[::-1]))
+    assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi, abs=1e-9)
+
+
+def test_the_radius_of_a_spiral_grows_with_the_angle():
+    """From radius 10 mm to 10.008 mm over 90 deg."""
+    points = places(rewritten("G0 X10 Y0\nG3 X0 Y10.008 I-10\n", tolerance=1e-4)[1:])
+    turned = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    assert len(points) > 50 and turned[-1] == pytest.approx(90, abs=1e-9)
+    np.testing.assert_allclose(np.hypot(*points.T), 10 + 0.008 * turned / 90, atol=1.1e-5)
+
+
+def test_a_quarter_is_split_once_where_that_suffices():
+    """Radius 10 mm: 90 deg have a sagitta of 2.93 mm, 45 deg of 0.76 mm, within 7/8 of 1 mm."""
+    points = places(rewritten("G0 X10 Y0\nG3 X0 Y10 J0 I-10\n", tolerance=1.0, step=0.1)[1:])
+    assert len(points) == 2 and tuple(points[1]) == (0, 10)
+    assert np.hypot(*points[0]) == pytest.approx(10, abs=1e-5)
+    assert math.degrees(math.atan2(*points[0][::-1])) == pytest.approx(45, abs=0.3)
+
+
+def test_a_radius_of_half_the_chord_may_be_rounded():
+    points = places(rewritten("G0 X0 Y0\nG2 X10 Y0 R4.999996\n", tolerance=0.01)[1:])
+    np.testing.assert_allclose(np.hypot(*(points - [5, 0]).T), 5, atol=2e-5)
+    assert points[:, 1].max() == pytest.approx(5, abs=0.01)
+
+
+@pytest.mark.parametrize(("move", "length", "looks"), [
+    ("G1 X30 Y0", 30, 2), ("G1 X18 Y24", 30, 2), ("G1 X41 Y0", 41, 3), ("G1 X19 Y0", 19, 1)])
+def test_the_correction_of_a_line_is_looked_up_at_steps(move, length, looks):
+    correct = Looked()
+    rewritten(f"G0 X0 Y0\n{move}\n", correct, step=20.0)
+    gaps = np.hypot(*np.diff(correct.points[-1], axis=0).T)
+    assert len(gaps) == looks and gaps == pytest.approx(length / looks)
+
+
+@pytest.mark.parametrize(("tolerance", "step", "looks"), [
+    (8.0, 10.0, 4),  # 31.4 mm by steps of 10 mm
+    (8.0, 8.0, 4), (8.0, 7.8, 5),
+    (0.1, 100.0, 32)])  # chords whose sagitta is 1/8 of the tolerance: 2 acos(1 - 1/800) = 0.1 rad
+def test_the_correction_of_an_arc_is_looked_up_at_steps_and_chords(tolerance, step, looks):
+    """Half a circle of radius 10 mm, and of 2 m with all lengths 200 times as large."""
+    for times in (1, 200):
+        correct = Looked()
+        rewritten(f"G0 X0 Y0\nG2 X{20 * times} Y0 I{10 * times}\n", correct, step=step * times,
+                  tolerance=tolerance * times)
+        points = correct.points[-1] / times
+        assert len(points) == looks + 1
+        np.testing.assert_allclose(np.hypot(*(points - [10, 0]).T), 10, rtol=1e-9)
+        turned = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 10))
+        np.testing.assert_allclose(turned, 180 - 180 / looks * np.arange(looks + 1), atol=1e-6)
+
+
+def test_what_lies_between_two_steps_is_found():
+    """30 mm in two steps of up to 20 mm: the roof at 15 mm splits the line there."""
+    lines = rewritten("G0 X0 Y0\nG1 X30 Y0 F100\n", roof(15), step=20.0)
+    assert lines[1:] == ["G1 X15.0 Y0.1 F100", "X30.0 Y0.0"]
+
+
+@pytest.mark.parametrize(("before", "move", "first", "last"), [
+    ("G0 Z5\nG91\nG0 Z-1\nG90", "G1 X40 Y0 Z0", 2, 0),  # from 4 to 0
+    ("G0 Z5", "G1 X40 Y0 Z-1", 2, -1), ("G0 Z5\nG91", "G1 X40 Y0 Z-1", -0.5, -0.5),
+    ("G0 Z5\nG91\nG1 X40 Y0 Z-1\nG90\nG0 X0 Y0", "G1 X40 Y0 Z0", 2, 0)])
+def test_another_axis_shares_a_move_from_where_it_is(before, move, first, last):
+    """The roof at 20 mm splits the move in halves."""
+    lines = rewritten(f"G0 X0 Y0\n{before}\n{move}\n", roof(20))[-2:]
+    assert values(lines, "Z") == [first, last]
+
+
+def test_an_extruder_has_its_own_kind_of_increments():
+    """M83: increments in spite of G90; M82: positions in spite of G91."""
+    lines = rewritten("M83\nG0 X0 Y0\nG1 X40 Y0 E3\nM82\nG0 X0 Y0\nG92 E1\nG91\nG1 X40 Y0 E3\n",
+                      roof(20))
+    assert values(lines[2:4], "E") == [1.5, 1.5] and values(lines[-2:], "E") == [2, 3]
+
+
+@pytest.mark.parametrize(("unit", "scale", "x", "z"), [
+    ("G21", 1.0, "10.123", "0.3333"), ("G20", 25.4, "10.1235", "0.33333")])
+def test_digits_one_more_in_inches_and_one_more_for_other_axes(unit, scale, x, z):
+    """A split after 10 of 30 units that begin at 0.12346, Z from 0 to 1."""
+    def correct(px, py):
+        return 0 * px, np.interp(px / scale, [0, 10.12346, 31], [0, scale, 0])
+    lines = rewritten(f"{unit}\nG0 X0.12346 Y0 Z0\nG1 X30.12346 Y0 Z1\n", Looked(correct),
+                      decimals=3, tolerance=0.1, step=10 * scale * (1 + 1e-9))
+    assert re.fullmatch(rf"G1 X{x} Y1.0 Z{z}", lines[2]), lines
+    assert len(lines) == 4 and lines[3].endswith(" Z1.0")
+
+
+def test_other_words_of_an_arc_are_kept_and_its_code_is_that_of_lines():
+    lines = rewritten("G0 X0 Y0\nG2 F200 (feed)\nX0 Y0 I5 S3\nG4 P1\nG1 F50 ; kept\n",
+                      tolerance=10.0)
+    assert lines[1] == "G1 F200 (feed)" and lines[2].endswith("S3") and "I" not in lines[2]
+    assert lines[-2:] == ["G4 P1", "G1 F50 ; kept"]
+
+
+@pytest.mark.parametrize(("program", "head"), [
+    ("G0 X0\n", "; one\n; two\nG0 X0\n"), ("G0 X0 ; (no)\n", "; one\n; two\nG0 X0 ; (no)\n"),
+    ("(yes)\nG0 X0\n", "(one)\n(two)\n(yes)\nG0 X0\n"),
+    ("%\r\nO12 (yes)\r\nG0\r\n", "%\r\nO12 (yes)\r\n(one)\r\n(two)\r\nG0\r\n"),
+    ("%\nG0\n", "%\n; one\n; two\nG0\n")])
+def test_comments_come_first_in_the_form_of_the_program(program, head):
+    assert commented(program, ["one", "two"]) == head
+
+
+def test_a_comment_has_no_character_that_could_end_it():
+    assert commented("(a)\nG0\n", ["a (b) \u00b5 c"]).splitlines()[0] == "(a _b_ _ c)"
+    assert len(commented("G0\n", ["x" * 300]).splitlines()[0]) == 202
