@@ -24,6 +24,7 @@ sys.path.insert(0, str(ROOT))
 
 import compensate  # noqa: E402
 import detecting  # noqa: E402
+import general  # noqa: E402
 import ingest  # noqa: E402
 import with_terms  # noqa: E402
 from rivals import RIVALS, Rival, installed  # noqa: E402
@@ -35,8 +36,10 @@ from selfcal_ros.outputs import write_json  # noqa: E402
 SIZES = (11, 21, 51, 101, 201, 401, 1001)
 OURS = {"solve": "selfcal", "re-solve": "selfcal (factored plan)",
         "uncertainty": "selfcal (uncertainty map)", "missing": "selfcal (3 % of the marks missing)",
-        "five views": "selfcal (defaults but causes)", "terms": "selfcal (all terms)"}
-MAX_SIZE = {"re-solve": 201, "uncertainty": 401, "five views": 101, "terms": 101}
+        "five views": "selfcal (defaults but causes)", "terms": "selfcal (all terms)",
+        "general": "selfcal (six general views)"}
+MAX_SIZE = {"re-solve": 201, "uncertainty": 401, "five views": 101, "terms": 101, "general": 101}
+GENERAL = ("scipy lsmr", "scipy splu")
 MISSING = 0.03
 TIME_LIMIT_S = 60.0
 MEMORY_LIMIT_MB = 8000
@@ -107,8 +110,9 @@ def ours(benchmark: str, data) -> tuple:
 def worker(benchmark: str, method: str, size: int) -> dict:
     """Measure one method in this process."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_MB * 2**20,) * 2)
-    if benchmark in ("five views", "terms"):
-        seconds, error = with_terms.solved(size, benchmark == "terms")
+    if benchmark in ("five views", "terms", "general"):
+        seconds, error = (general.solved(size, method) if benchmark == "general" else
+                          with_terms.solved(size, benchmark == "terms"))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         return {"benchmark": benchmark, "method": method, "n": size, "seconds": seconds,
                 "peak_mb": round(peak, 1), "max_error": error}
@@ -153,6 +157,8 @@ def jobs(sizes: list[int], methods: list[str]):
         for method in RIVALS:
             if method in methods:
                 yield "solve", method, size
+            if method in methods and method in GENERAL and size <= MAX_SIZE["general"]:
+                yield "general", method, size
 
 
 def measure_ingest(benchmark: str, number: int):
@@ -232,14 +238,14 @@ def main() -> int:
     rows, given_up = [], set()
     sizes = [int(size) for size in args.sizes.split(",") if size]
     for benchmark, method, size in jobs(sizes, methods):
-        if method in given_up:
+        if (benchmark, method) in given_up:
             rows.append({"benchmark": benchmark, "method": method, "n": size, "seconds": None,
                          "peak_mb": None, "max_error": None,
                          "note": "skipped: beyond its limit at a smaller N"})
         else:
             rows.append(measure(benchmark, method, size))
             if "skipped" in rows[-1].get("note", ""):
-                given_up.add(method)
+                given_up.add((benchmark, method))
         show(rows[-1])
     for benchmark, number in ((ingest.ENCODER, args.ingest), (ingest.DETECTIONS, args.detections)):
         for row in measure_ingest(benchmark, number) if number else ():

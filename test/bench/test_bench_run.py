@@ -51,7 +51,7 @@ def test_every_method_is_measured_and_exact(bench):
     assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
             "pyceres"} <= methods
     assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "uncertainty",
-                                                "missing", "five views", "terms"}
+                                                "missing", "five views", "terms", "general"}
     for row in rows:
         assert row.keys() >= KEYS and row["n"] == 7
         assert row["method"] in out
