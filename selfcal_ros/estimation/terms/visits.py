@@ -70,8 +70,13 @@ class ViewVisits:
 
     @cached_property
     def _relative(self) -> np.ndarray:
-        """Weights that add up to 1 over the visits of each mark, (V,)."""
-        return self.weight / np.bincount(self.mark, self.weight)[self.mark]
+        """Weights that add up to 1 over the visits of each mark, (V,).
+
+        Those of a mark that does not count, as one that is not known in a recheck, are equal.
+        """
+        unused = np.bincount(self.mark, self.weight)[self.mark] == 0
+        weight = np.where(unused, 1.0, self.weight)
+        return weight / np.bincount(self.mark, weight)[self.mark]
 
     @cached_property
     def repeated(self) -> bool:

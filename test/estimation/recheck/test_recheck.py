@@ -187,6 +187,26 @@ def test_marks_and_lines_that_are_missing_are_unknown():
     assert np.nansum(result.error_map.g_theta) == pytest.approx(0, abs=1e-15)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
+    """The calibration has not read it: map and u are those of a view without it."""
+    before, again = sessions()[0], replace(one_view(Artifact(5, PITCH, 8)).views[0], repeats=2)
+    kept = [replace(subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)),
+                    visits=None) for view in before.views]
+    plate = known_plate(saved(calibrate(replace(before, views=tuple(kept)), linear())), "r.json")
+    assert plate.kept.marks.sum() == 24
+    plan, rng = Plan("again", before.artifact, (again,)), np.random.default_rng(6)
+    truth = random_truth(plan.artifact, 1, rng, Spread(phi_rad=1e-5))
+    after = simulate_measurements(truth, plan, rng, visits=True, settings=CellSettings(
+        Sense.MICROSCOPE_MOVES, 20e-9, 2e-6, **QUIET))
+    view = after.views[0]
+    fewer = subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool))
+    whole, part = (recheck(replace(after, views=(replace(one, visits=seen),)), linear(), plate)
+                   for one, seen in ((view, view.visits), (fewer, None)))
+    assert whole.error_map.gx == pytest.approx(part.error_map.gx, abs=1e-15, nan_ok=True)
+    assert whole.error_map.u_gx == pytest.approx(part.error_map.u_gx, rel=1e-9, nan_ok=True)
+
+
 def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
     _, after = general((0, (0, 0)))
     with pytest.raises(InputError, match="its plate has 5 x 5 marks 10 mm apart and 8 lines, not "

@@ -30,6 +30,15 @@ def test_a_mark_that_was_visited_twice_has_the_weighted_mean_of_both():
         [[-3 + 6j, 0, 1 - 2j], [0, 0, 0]]))
 
 
+@pytest.mark.filterwarnings("error")
+def test_visits_of_a_mark_that_does_not_count_have_its_plain_mean():
+    """As a mark of a recheck that the calibration has not determined, weight 0."""
+    twice = visits([2, 0, 2, 0], [0, 5, 0, 15])
+    values = np.array([[4 + 4j, 7j, 8 - 4j, 3j]])
+    assert twice.means(values, 3) == pytest.approx(np.array([[4j, 0, 6]]))
+    assert twice.about_means(values, 3) == pytest.approx(np.array([[-2 + 4j, 3j, 2 - 4j, -1j]]))
+
+
 def test_a_visit_that_is_the_only_one_of_its_mark_is_its_mean():
     once = visits([2, 0, 3], [1, 5, 3])
     values = np.array([[4 + 4j, 7j, 8 - 4j]])
