@@ -247,6 +247,13 @@ def with_sub_views(views: Iterable[View]) -> tuple[View, ...]:
     return tuple(sub for view in views for sub in view.sub_views)
 
 
+def placings_of(views: Iterable[View]) -> tuple[int, ...]:
+    """Return the first of the views that belong to the same placing of the plate, for each view."""
+    first: dict[str, int] = {}
+    return tuple(row if view.cell is None else first.setdefault(view.plan_view, row)
+                 for row, view in enumerate(views))
+
+
 @dataclass(frozen=True)
 class Plan:
     """An artifact and the views in which it is to be measured, in their order.

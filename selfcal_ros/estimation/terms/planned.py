@@ -23,12 +23,12 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import WithinMarks
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, placings_of
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
 from selfcal_ros.estimation.terms.yaw import stage_yaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
-from selfcal_ros.model.view import View, with_sub_views
+from selfcal_ros.model.view import View, placings_of, with_sub_views
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
 MISALIGNMENT_M = 30e-6

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.yaw import StageYaw, stage_yaw
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import placings_of
 
 FARTHEST_M = 1e6
 """Largest valid deviation or offset of a visit."""
@@ -284,13 +284,6 @@ class TermInputs:
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
         return (*self.names_of(term), "")[view]
-
-
-def placings_of(views: Sequence[View]) -> tuple[int, ...]:
-    """Return the first of the views that belong to the same placing of the plate, for each view."""
-    first: dict[str, int] = {}
-    return tuple(row if view.cell is None else first.setdefault(view.plan_view, row)
-                 for row, view in enumerate(views))
 
 
 def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> TermInputs:

@@ -10,10 +10,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.visits import placings_of
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.model.view import with_sub_views
+from selfcal_ros.model.view import placings_of, with_sub_views
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread
 from test.support.collecting import START_NS, collect
