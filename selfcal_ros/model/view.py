@@ -2,7 +2,7 @@
 """Views: poses of the plate on the stage, orders of visits; plans: the views to be measured."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from selfcal_ros.errors import InputError
@@ -252,6 +252,25 @@ def placings_of(views: Iterable[View]) -> tuple[int, ...]:
     first: dict[str, int] = {}
     return tuple(row if view.cell is None else first.setdefault(view.plan_view, row)
                  for row, view in enumerate(views))
+
+
+def rotations_of(views: Sequence[View]) -> tuple[int, ...]:
+    """Return the first of the views that have the same rotation of the plate, for each view."""
+    return shared_rotations(placings_of(views), [view.cell or (0, 0) for view in views])
+
+
+def shared_rotations(placings: Sequence[int],
+                     cells: Sequence[tuple[int, int]]) -> tuple[int, ...]:
+    """Return the same for views with the placings `placings`, and their cells in the image.
+
+    A turned plate moves the marks in the image, and the camera's error there differs from that at
+    the middle of the cell: where it is known in x and y, readings are freed from it. Cells in one
+    line do not tell it: then each has a rotation of its own.
+    """
+    seen = {placing: [cell for one, cell in zip(placings, cells, strict=True) if one == placing]
+            for placing in placings}
+    return tuple(placing if all(len(set(along)) > 1 for along in zip(*seen[placing], strict=True))
+                 else row for row, placing in enumerate(placings))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,12 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
 from selfcal_ros.estimation.datum.plate import BothCovariance
-from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
+from selfcal_ros.estimation.joint.images import (
+    ImageNoise,
+    images_behind,
+    kept_rotations,
+    share_of,
+)
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
@@ -223,7 +228,7 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
                                                                 artifact.angular_count)
     return system_of(
         Marks(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid]),
-              tuple(index for index, *_ in grid)),
+              tuple(index for index, *_ in grid), rotations=kept_rotations(result, len(grid))),
         Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines),
               artifact.harmonics))
 

@@ -49,7 +49,8 @@ def exchanged(system: NormalEquations) -> NormalEquations:
     site = grid.views.site_index.reshape(grid.n_views, -1)[view, mark]
     weight[view, site] = grid.weight.reshape(grid.n_views, -1)[view, mark]
     return system_of(
-        Marks(tuple(poses), weight.reshape(grid.weight.shape), system.grid_index),
+        Marks(tuple(poses), weight.reshape(grid.weight.shape), system.grid_index,
+              rotations=grid.rotations),
         Marks((), np.zeros((0, system.angular.n_lines)), ()))
 
 

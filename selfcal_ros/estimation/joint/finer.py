@@ -62,7 +62,8 @@ def is_too_large(problem: Problem) -> bool:
 
 def equations_left(grid: PlacedSystem) -> int:
     """Return the readings of a map beyond plate and misalignments: two numbers each."""
-    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (3 * grid.n_views - 7)
+    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (
+        grid.n_misalignments - 7)
 
 
 def is_untested(problem: Problem) -> bool:
@@ -106,8 +107,8 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     if not isinstance(system, PlacedEquations):
         return None
     grid = system.grid
-    other = FinerEquations(PlacedSystem(grid.views.poses, grid.weight, spline), system.angular,
-                           system.grid_index, system.angular_index)
+    other = FinerEquations(PlacedSystem(grid.views.poses, grid.weight, spline, grid.rotations),
+                           system.angular, system.grid_index, system.angular_index)
     flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
     problem = replace(problem, system=other, places=None, residuals_xy=None,
                       conditions=replace(problem.conditions, slopes=flat))

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.yaw import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, shared_rotations
 
 KEY = "images"
 """Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
@@ -250,19 +250,34 @@ def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
     return found
 
 
+def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
+    """Return the first of the grid views that have the rotation of each, see `rotations_of`."""
+    if KEY not in result.extra:
+        return tuple(range(n_views))
+    placings, steps = zip(*_kept_cells(result, n_views), strict=True)
+    return shared_rotations([placings.index(number) for number in placings], steps)
+
+
+def _kept_cells(result: CalibrationResult, n_views: int) -> list[tuple[int, tuple[int, int]]]:
+    """Return the placing of the plate in each grid view of a result, and the step of its cell."""
+    kept = result.extra[KEY]
+    try:
+        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
+            kept["placing"], kept["step"], strict=True)]
+    except (TypeError, ValueError, KeyError, OverflowError):
+        seen = []
+    if len(seen) != n_views or not seen:
+        raise InputError(KEY, "no images of these views",
+                         "write the result again with `selfcal solve`")
+    return seen
+
+
 def images_behind(result: CalibrationResult, system: NormalEquations) -> ImageNoise | None:
     """Return the images behind a result, for `added_covariance` alone; None without images."""
     if not share_of(result):
         return None
-    kept, grid = result.extra[KEY], system.grid
-    try:
-        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
-            kept["placing"], kept["step"], strict=True)]
-    except (TypeError, ValueError, KeyError):
-        seen = []
-    if len(seen) != grid.n_views:
-        raise InputError(KEY, "no images of these views",
-                         "write the result again with `selfcal solve`")
+    grid = system.grid
+    seen = _kept_cells(result, grid.n_views)
     return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
                       np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 

@@ -297,7 +297,8 @@ def _block_inverse(problem: Problem, of_phi: np.ndarray) -> np.ndarray:
     grid = problem.system.grid
     block = grid.block.copy()
     block[::3, ::3] += of_phi
-    null = np.linalg.qr(grid.rigid[4:].T)[0]
+    block = grid.tied(block)
+    null = np.hstack([np.linalg.qr(grid.rigid[4:].T)[0], grid.differences])
     scale = float(np.trace(block))
     held = scale * (null @ null.T)
     return np.linalg.inv(block + held) - held / scale**2

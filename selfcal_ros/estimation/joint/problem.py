@@ -350,7 +350,8 @@ def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
 def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
     """Return the rotation of each view that its own readings show, times the half width, m.
 
-    The weighted least-squares fit of offset, rotation and magnification to each view alone.
+    The weighted least-squares fit of offset, rotation and magnification to each view alone; of
+    views that share a rotation, of one rotation and magnification to all.
 
     Parameters
     ----------
@@ -365,6 +366,9 @@ def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
     z = marks - (weight @ marks / total)[:, None]
     moment = (weight * (z.real**2 + z.imag**2)).sum(axis=1)
     turned = (weight * z.conj() * values).sum(axis=1).imag
+    if grid.differences.shape[1]:
+        together = np.equal.outer(grid.rotations, grid.rotations)
+        moment, turned = together @ moment, together @ turned
     return turned / np.where(moment > 0, moment, 1.0)
 
 

@@ -10,7 +10,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose, PlacedPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, rotations_of
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ class GridData:
         Repeats, or (sigma / u)^2 where detections declare their uncertainty; 0 = not read.
     sigma_declared : float
         Standard deviation of one reading as declared, m; NaN if not declared.
+    rotations : tuple of int
+        The first of the views that have the rotation of each view, see `rotations_of`.
     """
 
     index: tuple[int, ...]
@@ -96,6 +98,7 @@ class GridData:
     y: np.ndarray
     weight: np.ndarray
     sigma_declared: float
+    rotations: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +145,8 @@ def grid_data(measurements: Measurements) -> GridData:
         ones.append((flat, readings.count, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
-    return GridData(index, tuple(poses), y, weight, sigma)
+    return GridData(index, tuple(poses), y, weight, sigma,
+                    rotations_of([measurements.views[i].view for i in index]))
 
 
 def angular_data(measurements: Measurements) -> AngularData:

@@ -70,7 +70,8 @@ class NormalEquations:
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)
-        return core if _rank(values, _trace(core)) == len(values) - 7 else self.grid
+        free = len(values) - core.differences.shape[1]
+        return core if _rank(values, _trace(core)) == free - 7 else self.grid
 
     @cached_property
     def rigid(self) -> np.ndarray:
@@ -89,7 +90,7 @@ class NormalEquations:
         n = 3 * self.grid.n_views
         out[:n, :n] = of_grid
         out[self._phi_blocks] += ratio * self.angular.schur
-        return out
+        return self.grid.tied(out)
 
     @cached_property
     def _phi_blocks(self) -> tuple[np.ndarray, ...]:
@@ -175,14 +176,16 @@ class NormalEquations:
 
     @cached_property
     def nullity(self) -> int:
-        """Undetermined combinations of misalignments, including the datum's."""
+        """Undetermined misalignments: the datum's, and the differences that are none."""
         return self._null.shape[1]
 
     @cached_property
     def unseen(self) -> np.ndarray:
         """Undetermined misalignments other than the datum, (size, modes)."""
         # without turns the rigid modes are dependent: an orthonormal basis of their span
-        datum = np.vstack([self.rigid, self._turn_of_lines]) if self.apart else self.rigid
+        none = np.zeros((self.grid.differences.shape[1], self.size))
+        none[:, :3 * self.grid.n_views] = self.grid.differences.T
+        datum = np.vstack([self.rigid, *[self._turn_of_lines] * self.apart, none])
         rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
         rigid = rigid[:, size > 1e-9 * size[0]]
         if rigid.shape[1] == self.nullity:  # no reading determines the datum
@@ -298,7 +301,7 @@ def core_of(grid: GridSystem) -> GridSystem:
     part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
-    return GridSystem(grid.views.poses, weight * inside, grid.views.unit)
+    return GridSystem(grid.views.poses, weight * inside, grid.views.unit, grid.rotations)
 
 
 def _spectrum(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import helmert
 
 from selfcal_ros.estimation.lattice.connectivity import (
     Components,
@@ -35,10 +36,14 @@ class GridSystem:
         Weight of each reading; 0 = not read.
     unit : int
         Pitches in the unit of positions; 0 = the longer half width.
+    rotations : tuple of int
+        The first of the views that have the rotation of each view, see `rotations_of`. Empty: each
+        view has its own.
     """
 
-    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: int = 0) -> None:
-        self.weight = weight
+    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: int = 0,
+                 rotations: tuple[int, ...] = ()) -> None:
+        self.weight, self.rotations = weight, rotations
         self.views = LatticeViews(weight.shape[1:], poses, unit)
         self.read = weight > 0
         total = weight.sum(axis=0)
@@ -154,6 +159,32 @@ class GridSystem:
         return _real_columns(self.columns.T.reshape(self.n_sites, self.n_views, 2))
 
     @cached_property
+    def differences(self) -> np.ndarray:
+        """Differences between rotations that are one, orthonormal (3 views, k)."""
+        found = []
+        for first in dict.fromkeys(self.rotations):
+            views = np.flatnonzero(np.array(self.rotations) == first)
+            apart = np.zeros((3 * self.n_views, len(views) - 1))
+            apart[3 * views] = helmert(len(views)).T
+            found.append(apart)
+        return np.hstack([np.zeros((3 * self.n_views, 0)), *found])
+
+    @property
+    def n_misalignments(self) -> int:
+        """Number of misalignments: a rotation that views share counts once."""
+        return 3 * self.n_views - self.differences.shape[1]
+
+    def tied(self, normal: np.ndarray) -> np.ndarray:
+        """Return a normal matrix of misalignments with `differences` without information."""
+        apart = self.differences
+        if apart.shape[1]:
+            n = len(apart)
+            normal = normal.copy()
+            normal[:n] -= apart @ (apart.T @ normal[:n])
+            normal[:, :n] -= (normal[:, :n] @ apart) @ apart.T
+        return normal
+
+    @cached_property
     def block(self) -> np.ndarray:
         """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
         x, y = self.views.z.real.ravel(), self.views.z.imag.ravel()
@@ -167,7 +198,7 @@ class GridSystem:
             out[v, 0, :, 0], out[v, 1, :, 1], out[v, 2, :, 2] = zz, s, s
             out[v, 0, :, 1] = out[v, 1, :, 0] = -sy
             out[v, 0, :, 2] = out[v, 2, :, 0] = sx
-        return out.reshape(3 * self.n_views, -1)
+        return self.tied(out.reshape(3 * self.n_views, -1))
 
     @cached_property
     def response(self) -> np.ndarray:
@@ -178,7 +209,7 @@ class GridSystem:
     @cached_property
     def schur(self) -> np.ndarray:
         """Normal matrix of the misalignments alone, (3 views, 3 views) (method eq. 4.5)."""
-        out = self.block - self.coupled(self.response)
+        out = self.tied(self.block - self.coupled(self.response))
         return (out + out.T) / 2
 
     @cached_property

@@ -89,6 +89,8 @@ class PlacedSystem(GridSystem):
         Weight of each reading; 0 = not read.
     spline : MapSpline, optional
         Of the map, if it is not the one through its nodes.
+    rotations : tuple of int
+        As of `GridSystem`.
 
     Raises
     ------
@@ -99,8 +101,8 @@ class PlacedSystem(GridSystem):
     views: PlacedViews  # type: ignore[assignment]
 
     def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray,
-                 spline: MapSpline | None = None) -> None:
-        super().__init__((), weight)
+                 spline: MapSpline | None = None, rotations: tuple[int, ...] = ()) -> None:
+        super().__init__((), weight, rotations=rotations)
         self.views = PlacedViews(poses, spline)
 
     @cached_property

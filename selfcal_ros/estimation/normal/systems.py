@@ -23,7 +23,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.view import View, with_sub_views
+from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
 CACHED = 16
 CACHED_READINGS = 4_000_000
@@ -48,17 +48,20 @@ class Marks[Pose]:
         Position of the views in the measurement.
     harmonics : int
         Of the map, if it is a Fourier series.
+    rotations : tuple of int
+        As of `GridSystem`.
     """
 
     poses: tuple[Pose, ...]
     weight: np.ndarray
     index: tuple[int, ...]
     harmonics: int = 0
+    rotations: tuple[int, ...] = ()
 
 
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
     """Return the system of a measured plan, from the cache if the same marks were read."""
-    return system_of(Marks(grid.poses, grid.weight, grid.index),
+    return system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations),
                      Marks(angular.turns, angular.weight, angular.index, angular.harmonics))
 
 
@@ -66,8 +69,8 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     """Return the system of marks that were read, from the cache if present."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
-    key = (grid.weight.shape, grid.poses, grid.index, angular.weight.shape, angular.poses,
-           angular.index, angular.harmonics, digest.digest())
+    key = (grid.weight.shape, grid.poses, grid.index, grid.rotations, angular.weight.shape,
+           angular.poses, angular.index, angular.harmonics, digest.digest())
     with _lock:
         if key in _cache:
             _cache.move_to_end(key)
@@ -87,10 +90,11 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
     if placed:
         from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem  # splines
 
-        return PlacedEquations(PlacedSystem(placed, grid.weight), lines, grid.index, angular.index)
+        return PlacedEquations(PlacedSystem(placed, grid.weight, rotations=grid.rotations), lines,
+                               grid.index, angular.index)
     poses = tuple(pose for pose in grid.poses if isinstance(pose, LatticePose))
-    return NormalEquations(GridSystem(poses, grid.weight), lines, grid.index, angular.index,
-                           rank_only=rank_only)
+    return NormalEquations(GridSystem(poses, grid.weight, rotations=grid.rotations), lines,
+                           grid.index, angular.index, rank_only=rank_only)
 
 
 def lines_of(angular: Marks[float]) -> AngularSystem:
@@ -133,7 +137,8 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
         [v.repeats for _, v in grid_views], dtype=float)[:, None, None]
     lines = np.array([v.repeats for _, v in angular], dtype=float)
     return _equations(
-        Marks(poses, weight, tuple(i for i, _ in grid_views)),
+        Marks(poses, weight, tuple(i for i, _ in grid_views),
+              rotations=rotations_of([view for _, view in grid_views])),
         Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
               tuple(i for i, _ in angular), artifact.harmonics), rank_only=rank_only)
 

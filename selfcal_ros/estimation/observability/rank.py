@@ -59,7 +59,7 @@ def deficiency(system: NormalEquations) -> int:
 def unknowns_of(system: NormalEquations) -> int:
     """Return the number of parameters of map, plate and misalignments."""
     grid = system.grid
-    return 2 * (grid.n_sites + grid.n_marks) + 3 * grid.n_views
+    return 2 * (grid.n_sites + grid.n_marks) + grid.n_misalignments
 
 
 def full_observability(system: NormalEquations, artifact: Artifact,
@@ -139,6 +139,7 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
         return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(text,))
     kept = 2 * int(sites.sum() + system.known_marks.sum())
     kept += int(system.known_views[:3 * system.grid.n_views].sum())
+    kept -= system.grid.differences.shape[1]
     return Observability(kept, kept, 0, True)
 
 
@@ -156,7 +157,7 @@ def _placed_observability(system: NormalEquations, artifact: Artifact,
                           views: tuple[View, ...]) -> Observability:
     known, grid = int(system.known_sites.sum()), system.grid
     if _nodes_known(system):
-        kept = 2 * (known + int(system.known_marks.sum())) + 3 * grid.n_views
+        kept = 2 * (known + int(system.known_marks.sum())) + grid.n_misalignments
         return Observability(kept, kept, 0, True)
     missing = len(system.loose_modes) or 2 * (grid.n_sites - known)
     missing += angular_deficiency(system)

@@ -67,6 +67,7 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
         # the angular lines relate the rotations as far as they were read
         weight = system.grid_scale / system.angular_scale
         block[np.ix_(system.phi_at, system.phi_at)] += weight * system.angular.schur
+        block = grid.tied(block)
     explained = right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
     return bool(total - explained <= MATCH * scale)
 

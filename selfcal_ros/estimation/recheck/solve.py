@@ -153,7 +153,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     before = plate.result.verdict
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
-        _views(readings, seen), _observability(seen), noise, measurements.all_rejected(),
+        _views(readings, seen), _observability(readings, seen), noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
         sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
@@ -348,9 +348,10 @@ def _views(readings: PlateReadings, seen: Seen) -> tuple[ViewResult, ...]:
     return tuple(out)
 
 
-def _observability(seen: Seen) -> Observability:
+def _observability(readings: PlateReadings, seen: Seen) -> Observability:
     """Return that of the marks that were read: what is known is determined."""
-    unknowns = 2 * int(seen.known.sum()) + len(seen.parameters)
+    grid = readings.problem.system.grid
+    unknowns = 2 * int(seen.known.sum()) + grid.n_misalignments
     return Observability(unknowns, unknowns, 0, True)
 
 

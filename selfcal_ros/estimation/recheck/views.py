@@ -136,13 +136,16 @@ class PlateReadings:
         return frames[:, None] * fields[(slice(None), *self.at)].T
 
     def of_misalignments(self) -> np.ndarray:
-        """Return the readings for a unit of phi, Re tau, Im tau of each view, complex (r, 3 v)."""
+        """Return the readings for a unit of phi, Re tau, Im tau of each view, complex (r, 3 v).
+
+        Without differences of rotations that are none.
+        """
         grid = self.problem.system.grid
         out = np.zeros((len(self.at[0]), 3 * grid.n_views), dtype=complex)
         each = np.arange(len(out))
         for part, shape in enumerate((grid.views.z[self.at[1:]] * 1j, 1.0, 1j)):
             out[each, 3 * self.at[0] + part] = shape
-        return out
+        return out - (out @ grid.differences) @ grid.differences.T
 
     def of_terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Return what the terms of the marks make of the readings, (r, p), and their sizes, (p,).
@@ -247,8 +250,8 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
     NotSettledError
         If the rotations of the plate do not converge.
     """
-    views = readings.problem.system.grid.views
-    fields = readings.of_field()
+    grid = readings.problem.system.grid
+    views, fields = grid.views, readings.of_field()
     design = np.hstack([complex_design(fields), stacked(readings.of_misalignments())])
     touched = (np.abs(fields) > 0).any(axis=0).reshape(views.z_sites.shape)
     placed = not isinstance(views, LatticeViews)
@@ -262,7 +265,10 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
     for _ in range(MOST_DATUMS):
         if known.sum() < 3 or (strict == 2 and known.sum() < touched.sum() / 2):
             break
-        gain = _in_datum(design, noise, z, known, columns, VAGUE * placed)
+        held = np.zeros((design.shape[1], 3 + grid.differences.shape[1]))
+        held[:2 * z.size, :3] = stacked(Gauge(z, known, scale=False).orthonormal)
+        held[2 * z.size:, 3:] = grid.differences
+        gain = _in_datum(design, noise, held, columns, VAGUE * placed)
         if strict == 2:
             return _converged(readings, design, gain, known, known_parts=(plate, microscope))
         u2 = (gain.rows ** 2 @ spread + gain.free / unit)[:2 * z.size].reshape(2, *z.shape)
@@ -277,12 +283,10 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
             2 * int(known.sum()), 2 * known.size, 2 * left, False))
 
 
-def _in_datum(design: np.ndarray, noise: np.ndarray, z: np.ndarray, known: np.ndarray,
-              columns: np.ndarray, vague: float) -> Gain:
-    """Return the estimate of all unknowns: no translation, no rotation over the known nodes."""
-    basis = np.zeros((design.shape[1], 3))
-    basis[:2 * z.size] = stacked(Gauge(z, known, scale=False).orthonormal)
-    found = least_squares(design[:, columns], noise, basis[columns], vague)
+def _in_datum(design: np.ndarray, noise: np.ndarray, held: np.ndarray, columns: np.ndarray,
+              vague: float) -> Gain:
+    """Return the estimate of all unknowns, combinations `held` at 0, with all but `columns` 0."""
+    found = least_squares(design[:, columns], noise, held[columns], vague)
     rows, free = np.zeros((design.shape[1], len(noise))), np.zeros(design.shape[1])
     rows[columns], free[columns] = found.rows, found.free
     return Gain(rows, noise, free)

@@ -41,11 +41,14 @@ def measured(image_m: float, seed: int, *, size: int = 7, repeats: int = 1, miss
 def dense(measurements):
     """Return the matrix of (2.2), rows x then y of every reading, and the stop of each reading.
 
-    Unknowns: G and A, x then y of each site and mark, then phi, tx, ty of each sub-view.
+    Unknowns: G and A, x then y of each site and mark, then tx, ty of each sub-view, then phi of
+    each view of the plan: its plate is placed once.
     """
     (nx, ny), (hx, hy) = measurements.artifact.shape, measurements.artifact.half
     count = sum(len(view.m) for view in measurements.views)
-    rows, stops = np.zeros((2 * count, 4 * nx * ny + 3 * len(measurements.views))), []
+    placed = list(dict.fromkeys(view.view.plan_view for view in measurements.views))
+    offsets = 4 * nx * ny + 2 * len(measurements.views)
+    rows, stops = np.zeros((2 * count, offsets + len(placed))), []
     place = 0
     for number, view in enumerate(measurements.views):
         turn = round(view.view.rotation_rad / (np.pi / 2))
@@ -56,12 +59,12 @@ def dense(measurements):
             site = (x + a + hx) * ny + y + b + hy
             mark = (m + hx) * ny + n + hy
             stops.append((view.view.rotation_rad, site))
-            at, own = 2 * place, 4 * nx * ny + 3 * number
+            at, own = 2 * place, 4 * nx * ny + 2 * number
             rows[at, 2 * site] = rows[at + 1, 2 * site + 1] = 1
             rows[at:at + 2, 2 * (nx * ny + mark):2 * (nx * ny + mark) + 2] = [
                 [cosine, -sine], [sine, cosine]]
-            rows[at:at + 2, own] = -y, x
-            rows[at, own + 1] = rows[at + 1, own + 2] = 1
+            rows[at:at + 2, offsets + placed.index(view.view.plan_view)] = -y, x
+            rows[at, own] = rows[at + 1, own + 1] = 1
             place += 1
     return rows, np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1)
 
