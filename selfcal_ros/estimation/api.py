@@ -71,7 +71,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     camera, measurements = _camera(measurements, options)
     options = options if camera is None else _knowing(camera, options)
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
-    result = judged(solved, measurements, options)
+    solved = judged(solved, measurements, options)
+    result = solved.result
     if not result.verdict.qualified:
         check_placing(measurements)
     shown = {} if camera is None else camera.to_dict()

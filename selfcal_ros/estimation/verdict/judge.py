@@ -68,8 +68,8 @@ the uncertainty from the residuals is taken to cover it."""
 
 
 @one_thread()
-def judged(solved: Solved, measurements: Measurements, options: Options) -> CalibrationResult:
-    """Return the result with its verdict as data, without sentences.
+def judged(solved: Solved, measurements: Measurements, options: Options) -> Solved:
+    """Return the solution that allows for causes, its result with its verdict as data.
 
     Parameters
     ----------
@@ -110,8 +110,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Cali
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked),
                                                  *_untested(solved)),
         provenance=provenance_of(measurements, options))
-    return replace(result, budget=tuple(budget_lines(result)),
-                   excluded=_excluded(solved, result, options))
+    return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
+                                          excluded=_excluded(solved, result, options)))
 
 
 def _with_declared(searched: SearchResult, options: Options) -> SearchResult:

@@ -139,6 +139,32 @@ def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, mo
         assert not calibrate(measurements, given).verdict.causes
 
 
+@pytest.mark.parametrize(("bend_m", "yaw_rad"), [(1e-7, 0.0), (1e-7, 1e-4), (-1e-7, 1e-4)])
+def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly(bend_m, yaw_rad):
+    """One rotation of all cells tells them apart; the map, and the yaw, are freed from the bend."""
+    away, turned = [], []
+    for seed in range(4):
+        truth, _ = measured(0.0, seed, phi_rad=1e-3, t_m=1e-5)
+        shape = np.zeros((2, 2, 3))
+        shape[1] = [[0, bend_m, 0], [-bend_m, 0, 0]]
+        slope = np.linspace(-yaw_rad, yaw_rad, 7)[:, None] + np.zeros(7)
+        truth = replace(truth, yaw=slope, plate_shape_m=shape)
+        found = calibrate(simulate_measurements(
+            truth, image_plan(7, repeats=1), np.random.default_rng(seed),
+            settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0)))
+        assert [cause.name for cause in found.verdict.causes] == ["plate_shape"]
+        assert found.verdict.qualified
+        of = {(one.component, one.view): one.value for term in found.model.terms
+              if term.name == "plate_shape" for one in term.estimates}
+        for name, true in (("x xy", bend_m / 2), ("y xx", -bend_m)):  # the shape is 2xy
+            assert of[name, "90"] - of[name, "0"] == pytest.approx(true, abs=MARK)
+        emap = found.error_map
+        away.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
+        turned.append(turns(truth, found.extra["camera"]))
+    within(np.array(away), 20)
+    within(np.array(turned), 20)
+
+
 def test_left_out_of_the_model_it_is_named():
     _, measurements = measured(MARK, 3, stage_yaw_rad=3e-5)
     blind = calibrate(measurements, Options(assumed=()))

@@ -37,7 +37,7 @@ def readings():
 def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     options = Options(misalignment_model="linear", causes=False)
     solved = replace(solve_joint(readings, options), axes=(p, 3 * ARCSEC_RAD))
-    verdict = judged(solved, readings, options).verdict
+    verdict = judged(solved, readings, options).result.verdict
     assert verdict.grade is (Grade.GOOD if holds else Grade.NOT_QUALIFIED)
     assert verdict.failed == (() if holds else (
         Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=p),))
