@@ -193,8 +193,8 @@ def _export(args: argparse.Namespace) -> int:
                 "zero at home by the controller"]
     error_map, active = result.error_map, _active(args, frame)
     if active is not None:
-        say_bent(args, bends_between(error_map, frame, active))
         error_map = combined(error_map, frame, active)
+        say_bent(args, bends_between(error_map, frame, active))
         comments.append("replaces the table that was loaded during the calibration")
     texts = {args.output: cal_text([export.table_xy(error_map, frame)],
                                    comments=comments, decimals=export.DECIMALS)}

@@ -16,6 +16,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.units import M_PER_MM
 
 Correction = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """What a controller adds to commanded positions x, y; all in the unit of its frame."""
@@ -135,9 +136,21 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
 
     To be at p the controller then has to show p + G(p); with the former table this meant
     p + G(p) + c(p + G(p)) on the encoder, so the new correction is G(p) + c(p + G(p)).
+
+    Raises
+    ------
+    InputError
+        If the former table is too steep to be one of this stage.
     """
     plate = error_map.artifact
     cx, cy = active(*frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy))
+    step_m = frame.unit_m * max(float(np.abs(np.diff(c, axis=axis)).max())
+                                for c in (cx, cy) for axis in (0, 1))
+    if step_m > plate.grid_pitch_m / 4:
+        raise InputError(
+            "--onto", f"the active table changes by up to {step_m / M_PER_MM:.3g} mm between "
+            f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart",
+            "is it that of this stage, in this unit? beyond its own field a table may extrapolate")
     return replace(error_map, gx=error_map.gx + frame.sign_x * cx * frame.unit_m,
                    gy=error_map.gy + frame.sign_y * cy * frame.unit_m)
 
