@@ -102,49 +102,58 @@ def attachments(files: list[Path]) -> dict[str, bytes]:
     out: dict[str, bytes] = {}
     for path in files:
         with path.open("rb") as file:
+            text = summary_of(file, path)[1]
             try:
-                summary = _summary(file)
-            except (struct.error, ValueError) as error:
-                raise InputError(str(path), "no MCAP file with a summary", REMEDY) from error
-            try:
-                for raw in _records(file, summary):
+                for body in (body for opcode, body in records_in(text, path) if opcode == INDEX):
+                    raw = _attachment(file, *struct.unpack_from("<QQ", body))
                     out[_text(raw, 16)[0]] = _content(raw)
-            except (struct.error, ValueError, IndexError) as error:
+            except (struct.error, ValueError) as error:
                 raise InputError(str(path), "an attachment is damaged", "embed the file again into "
                                  "a copy of the recording") from error
     return out
 
 
-def _summary(file: BinaryIO) -> bytes:
-    """Return the summary at the end of an MCAP file; ValueError if it is damaged."""
+def _attachment(file: BinaryIO, place: int, count: int) -> bytes:
+    """Return the body of an attachment; ValueError unless its checksum is correct."""
+    file.seek(min(place, file.seek(0, os.SEEK_END)))
+    raw = file.read(min(count, LARGEST_ATTACHMENT))
+    if len(raw) < max(count, 10) or raw[0] != ATTACHMENT or int.from_bytes(
+            raw[-4:], "little") not in (0, zlib.crc32(raw[9:-4])):  # 0 = not computed
+        raise ValueError("damaged")
+    return raw[9:]
+
+
+def summary_of(file: BinaryIO, path: Path) -> tuple[int, bytes]:
+    """Return beginning and content of the summary of an MCAP file.
+
+    Raises
+    ------
+    InputError
+        If it has none, or a damaged one.
+    """
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - TAIL, 0))
     tail = file.read()
-    if len(tail) < TAIL or tail[0] != FOOTER or not tail.endswith(MAGIC):
-        raise ValueError("no footer")
-    start, _, crc = struct.unpack_from("<QQI", tail, 9)
+    whole = len(tail) == TAIL and tail[0] == FOOTER and tail.endswith(MAGIC)
+    start, _, crc = struct.unpack_from("<QQI", tail, 9) if whole else (0, 0, 0)
     if not 0 < start <= size - TAIL <= start + LARGEST_SUMMARY:
-        raise ValueError("no summary")
+        raise InputError(str(path), "no MCAP file with a summary", REMEDY)
     file.seek(start)
-    summary = file.read(size - TAIL - start)
-    if crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):  # 0 = not computed
-        raise ValueError("damaged summary")
-    return summary
+    text = file.read(size - TAIL - start)
+    if crc not in (0, zlib.crc32(tail[:25], zlib.crc32(text))):  # 0 = not computed
+        raise InputError(str(path), "its summary is damaged", REMEDY)
+    return start, text
 
 
-def _records(file: BinaryIO, summary: bytes) -> Iterator[bytes]:
-    """Yield the bodies of the attachments of an MCAP file, their checksums tested."""
+def records_in(text: bytes, path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and body of the records of a summary; InputError if one is not complete."""
     at = 0
-    while at < len(summary):
-        opcode, length = struct.unpack_from("<BQ", summary, at)
-        if opcode == INDEX:
-            place, count = struct.unpack_from("<QQ", summary, at + 9)
-            file.seek(min(place, file.seek(0, os.SEEK_END)))
-            raw = file.read(min(count, LARGEST_ATTACHMENT))
-            if len(raw) < max(count, 10) or raw[0] != ATTACHMENT or int.from_bytes(
-                    raw[-4:], "little") not in (0, zlib.crc32(raw[9:-4])):  # 0 = not computed
-                raise ValueError("damaged")
-            yield raw[9:]
+    while at + 9 <= len(text):
+        opcode, length = struct.unpack_from("<BQ", text, at)
+        body = text[at + 9:at + 9 + length]
+        if len(body) < length:
+            raise InputError(str(path), "its summary is damaged", REMEDY)
+        yield opcode, body
         at += 9 + length
 
 

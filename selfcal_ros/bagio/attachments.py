@@ -24,7 +24,7 @@ from selfcal_ros.bagio.mcap_salvage import HEAD
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.errors import InputError
 from selfcal_ros.outputs import atomic_file
-from selfcal_ros.results import REMEDY, attachments
+from selfcal_ros.results import REMEDY, attachments, records_in, summary_of
 
 BLOCK = 1 << 20
 DATA_END_SIZE = HEAD.size + 4
@@ -114,35 +114,19 @@ def _copy(file: BinaryIO, out: BinaryIO, size: int) -> None:
 
 def _summary(file: BinaryIO, path: Path) -> _Summary:
     """Return the end of a file; InputError if it has no complete one."""
-    tail = HEAD.size + FOOTER_SIZE + len(MAGIC)
-    size = file.seek(0, 2)
-    file.seek(max(size - tail, 0))
-    raw = file.read()
-    start = int.from_bytes(raw[HEAD.size:HEAD.size + 8], "little")
-    complete = len(raw) == tail and raw[0] == Opcode.FOOTER and raw.endswith(MAGIC) and (
-        DATA_END_SIZE < start <= size - tail)
-    if complete:
-        file.seek(start - DATA_END_SIZE)
-        complete = file.read(HEAD.size) == HEAD.pack(Opcode.DATA_END, 4)
-    if not complete:
+    start, text = summary_of(file, path)
+    file.seek(max(start - DATA_END_SIZE, 0))
+    if file.read(HEAD.size) != HEAD.pack(Opcode.DATA_END, 4):
         raise InputError(str(path), "no MCAP file with a summary", REMEDY)
-    file.seek(start)
-    text, at = file.read(size - tail - start), 0
-    crc = int.from_bytes(raw[HEAD.size + 16:HEAD.size + 20], "little")
-    if crc not in (0, zlib.crc32(raw[:HEAD.size + 16], zlib.crc32(text))):  # 0 = not computed
-        raise InputError(str(path), "its summary is damaged", REMEDY)
     others, statistics, index = [], None, []
-    while at + HEAD.size <= len(text):
-        opcode, length = HEAD.unpack_from(text, at)
-        body = text[at + HEAD.size:at + HEAD.size + length]
+    for opcode, body in records_in(text, path):
         record = _parsed(opcode, body)
-        if len(body) < length or (opcode in _WRITTEN_ANEW[1:] and record is None):
+        if opcode in _WRITTEN_ANEW[1:] and record is None:
             raise InputError(str(path), "its summary is damaged", REMEDY)
         if isinstance(record, Statistics):
             statistics = record
         elif isinstance(record, AttachmentIndex):
             index.append(record)
         elif opcode not in _WRITTEN_ANEW:
-            others.append(text[at:at + HEAD.size + length])
-        at += HEAD.size + length
+            others.append(HEAD.pack(opcode, len(body)) + body)
     return _Summary(start - DATA_END_SIZE, b"".join(others), statistics, tuple(index))
