@@ -22,8 +22,7 @@ from selfcal_ros.reporting.figures.places import plan_figure
 from selfcal_ros.reporting.report import chapters, svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.simulation.exposing import Exposure
-from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.simulation.rendering import Camera, Exposure
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.images import Picture

@@ -22,9 +22,8 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.simulation.bag import IMAGES, event_fields, image_fields, write_truth
 from selfcal_ros.simulation.cell import JOINTS, Event, view_events
-from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import Truth, random_truth
-from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.simulation.rendering import Camera, Exposure, exposures
 from selfcal_ros.simulation.spec import camera_of, settings_of, spread_of
 
 LEAD_NS = 20_000_000

@@ -17,10 +17,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.simulation.cell import Event
-from selfcal_ros.simulation.exposing import Exposure
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.physics import stage_error
-from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.simulation.rendering import Camera, Exposure
 from selfcal_ros.simulation.spec import Simulation
 
 QOS = {

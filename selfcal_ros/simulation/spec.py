@@ -19,9 +19,8 @@ from selfcal_ros.files import read_yaml
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
-from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
-from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.simulation.rendering import Camera, Exposure, exposures
 from selfcal_ros.units import M_PER_UM, NS_PER_S, RAD_PER_MRAD
 
 PARTS = ("lost", "outliers", "low_score", "not_finite", "unknown_mark", "duplicated")

@@ -18,9 +18,8 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.simulation.exposing import Exposure, exposures
 from selfcal_ros.simulation.machine import AXES, Spread, random_truth
-from selfcal_ros.simulation.rendering import Camera
+from selfcal_ros.simulation.rendering import Camera, Exposure, exposures
 from test.simulation.test_physics import (
     PLATE,
     QUARTER,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal_ros.simulation.exposing import Exposure
+from selfcal_ros.simulation.rendering import Exposure
 from selfcal_ros.simulation.spec import read_simulation
 
 SIM = {
