@@ -80,7 +80,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         yaw = yaw_of(solved.model, measurements.sense)
         shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
     result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
-    result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
+    if measurements.has_images:
+        result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
     if not options.prior:
         return result
     from selfcal_ros.estimation.comparison.covariance import xy_covariance  # rarely wanted

@@ -44,8 +44,7 @@ from selfcal_ros.reporting.summary.numbers import (
 )
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.findings import advice, unit_of, what_it_is
-from selfcal_ros.reporting.words.phrases import excluded_text, line_text
-from selfcal_ros.reporting.words.tables import dof_text
+from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_MARKS = 51 * 51

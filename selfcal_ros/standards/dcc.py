@@ -17,8 +17,8 @@ from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import PRIOR, CalibrationResult
 from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.reporting.chapters import convention_section
-from selfcal_ros.reporting.words.phrases import excluded_text, line_text
-from selfcal_ros.reporting.words.tables import dof_text, quantity_text
+from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
+from selfcal_ros.reporting.words.tables import quantity_text
 from selfcal_ros.standards.details import UNITS
 from selfcal_ros.units import UM_PER_M
 

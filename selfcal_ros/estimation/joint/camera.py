@@ -310,7 +310,7 @@ def few_read(measurements: Measurements, camera: Camera | None) -> tuple[Finding
     Those of all views together, or of one.
     """
     few = []
-    counts = _read_and_shown(measurements) if measurements.has_images else {}
+    counts = _read_and_shown(measurements)
     for cell in dict.fromkeys(cell for _, cell in counts):
         of_views = {name: count for (name, at), count in counts.items() if at == cell}
         total = np.sum(list(of_views.values()), axis=0)

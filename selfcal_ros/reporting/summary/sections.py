@@ -34,8 +34,7 @@ from selfcal_ros.reporting.summary.numbers import (
     um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
-from selfcal_ros.reporting.words.phrases import counted_views, excluded_text, of_few_read
-from selfcal_ros.reporting.words.tables import dof_text
+from selfcal_ros.reporting.words.phrases import counted_views, dof_text, excluded_text, of_few_read
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 

@@ -21,6 +21,15 @@ OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
 """How a line of the budget was found, given the file of the plate."""
 
 
+COUNTED_DOF = 1e5
+"""Degrees of freedom from which on they are shown as ``many``."""
+
+
+def dof_text(dof: float) -> str:
+    """Return degrees of freedom as an integer, or ``many``."""
+    return f"{dof:.0f}" if dof < COUNTED_DOF else "many"
+
+
 def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
     """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are no views.
 

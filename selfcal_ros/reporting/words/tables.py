@@ -15,7 +15,7 @@ from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
-from selfcal_ros.reporting.words.phrases import line_text
+from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 
@@ -68,9 +68,6 @@ def _limit_text(item: HeldOut, why: str) -> str:
     return f", {'EXCEEDS' if item.exceeds else 'within'} the limit of {item.limit:.2f}"
 
 
-COUNTED_DOF = 1e5
-"""Degrees of freedom from which on they are shown as ``many``."""
-
 _QUANTITIES = {
     ("xy", False): "XY, one coordinate at the nodes of the map",
     ("xy", True): "XY, one coordinate anywhere in the field, map interpolated between its nodes",
@@ -99,11 +96,6 @@ def budget_text(found: list[Budget]) -> list[str]:
                   f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
                   f"{budget.U_max * factor:12.4g}          95.45 % coverage"]
     return lines
-
-
-def dof_text(dof: float) -> str:
-    """Return degrees of freedom as an integer, or ``many``."""
-    return f"{dof:.0f}" if dof < COUNTED_DOF else "many"
 
 
 _CERTIFICATES: dict[str, str] = {
