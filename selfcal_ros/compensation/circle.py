@@ -52,7 +52,7 @@ class Circle:
         Harmonics of the Fourier series that it is instead; 0 = none.
     """
 
-    def __init__(self, values: np.ndarray, *, cubic: bool, harmonics: int = 0) -> None:
+    def __init__(self, values: np.ndarray, *, cubic: bool, harmonics: int) -> None:
         self._count = len(values)
         self._holes = bool(np.isnan(values).any())
         self._closed = np.append(values, values[:1])

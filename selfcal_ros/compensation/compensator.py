@@ -92,7 +92,7 @@ class Compensator:
         self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
         self._theta = Circle(error_map.g_theta, cubic=method == "bicubic",
                              harmonics=error_map.artifact.harmonics)
-        self._u_theta = Circle(error_map.u_g_theta, cubic=False)
+        self._u_theta = Circle(error_map.u_g_theta, cubic=False, harmonics=0)
 
     @property
     def has_theta(self) -> bool:

@@ -86,7 +86,7 @@ def middle_of(numbers: np.ndarray, width: int, known: np.ndarray | None = None) 
     `known` ones, else 0.
     """
     low = int(max(numbers.min(), -MOST_CELLS)) - width
-    count = np.bincount(np.clip(numbers - low, 0, 2 * MOST_CELLS).astype(int), minlength=2 * width)
+    count = np.bincount(np.clip(numbers - low, 0, 2 * MOST_CELLS).astype(int))
     held = np.convolve(np.append(count, np.zeros(width, int)), np.ones(width, int), mode="valid")
     best = np.arange(len(held))[held >= held.max() - len(numbers) / (4 * width)] + low + width // 2
     middle = round(float(np.median(known))) if known is not None and len(known) else 0
