@@ -31,7 +31,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.simulation.bag import event_fields
-from selfcal_ros.topics import INPUT_TOPICS, qos_profile
+from selfcal_ros.topics import ENCODER_TOPIC, INPUT_TOPICS, qos_profile
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan
 
@@ -121,7 +121,8 @@ def test_metadata_counts_what_every_file_holds(tmp_path, events):
     assert about["duration"]["nanoseconds"] == 11
     assert [file["message_count"] for file in about["files"]] == [7, 5]
     by_topic = {t["topic_metadata"]["name"]: t for t in about["topics_with_message_count"]}
-    assert by_topic["/stage/joint_states"]["message_count"] == 12
+    assert {name: topic["message_count"] for name, topic in by_topic.items()} == {
+        f"/{topic}": 12 * (topic == ENCODER_TOPIC) for topic in INPUT_TOPICS}
     assert by_topic["/stage/joint_states"]["topic_metadata"]["offered_qos_profiles"] == [QOS]
 
 
@@ -236,6 +237,14 @@ def test_the_plan_that_is_running_is_taken_up(tmp_path, phases, goes_on, reverse
     if again is not None:
         assert again.path == writer.path
         again.close()
+
+
+@pytest.mark.parametrize(("ahead_s", "goes_on"), [(-3600, True), (30, True), (90, False)])
+def test_a_run_that_would_hide_every_later_one_is_over(tmp_path, ahead_s, goes_on):
+    """A collector uses commands stamped up to a minute ahead of their reception, no others."""
+    with declared(start(tmp_path, NOW)) as writer:
+        record(writer, [command(Phase.PLACE, time.time_ns() + ahead_s * 10**9)])
+    assert bool(unfinished(tmp_path)) == goes_on
 
 
 def test_the_journal_written_last_counts(tmp_path):

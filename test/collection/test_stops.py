@@ -1,16 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check stops through the collector: extra readings, none an outlier, and never a repeat."""
 
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 
 import numpy as np
 import pytest
 
 from selfcal_ros.collection.collector import view_progress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
-from selfcal_ros.collection.marks.stops import stage_aside, without_aside
-from selfcal_ros.model.artifact import MapGrid
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.collection.marks.stops import (
+    beside,
+    cells_of,
+    count_stops,
+    marks_shown,
+    middles,
+    numbers_of,
+    places_of_cells,
+    stage_aside,
+    without_aside,
+)
+from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.pose import Image
+from selfcal_ros.model.readings import GridVisits, Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import START_NS, Scene, collect, gathered
@@ -164,6 +175,69 @@ def test_which_stops_are_aside():
     both[1, 1] = 20e-6  # along both axes: no check stop of either
     assert not stage_aside(key, both, OFFSET)[:, 1].any()
     assert stage_aside(np.zeros(6, int), np.tile(np.arange(6) * 5e-6, (2, 1)), OFFSET) is None
+
+
+def test_a_stop_on_one_side_alone_is_a_repeat():
+    """Two marks with two repeats each, about one of them a third stop at +x; then one at -x too."""
+    one_side = np.array([[0, 0, 20, 0, 0], [0, 0, 0, 0, 0]]) * 1e-6
+    for place, mark, extra in ((one_side, [0, 0, 0, 1, 1], 0),
+                               (np.hstack([one_side, [[-20e-6], [0]]]), [0, 0, 0, 1, 1, 0], 2)):
+        n = len(mark)
+        visits = GridVisits(**{field.name: np.zeros(n) for field in fields(GridVisits)
+                           if field.default is MISSING and field.default_factory is MISSING}
+                        | {"mark": np.array(mark), "count": np.ones(n, int), "dx": place[0],
+                           "dy": place[1], "offset_x": np.zeros(n), "offset_y": np.zeros(n)})
+        count = np.bincount(mark)
+        readings = replace(progress_of(checked())[0], m=np.arange(2), n=np.arange(2), count=count,
+                           visits=visits)
+        view = View("0", check_marks=1, check_offset_m=OFFSET)
+        stops, done = count_stops(view, readings)
+        assert stops.tolist() == (count - [extra, 0]).tolist() and done == 0
+
+
+WIDE = View("90", np.pi / 2, (0.01, 0.0), image=Image(3, 5, 0.01))
+
+
+def test_cells_are_numbered_in_their_order_and_what_lies_beyond_them_is_none():
+    cells = {x + 1j * y: number for number, (x, y) in enumerate(WIDE.image.cells)}
+    every = np.array([x + 1j * y for x in (-10**6, *range(-9, 10), 10**6)
+                      for y in (-10**6, *range(-9, 10), 10**6)])
+    assert numbers_of(WIDE, every).tolist() == [cells.get(cell, -1) for cell in every]
+
+
+def test_the_place_of_a_cell_is_as_many_pitches_off_along_the_rows_of_the_plate():
+    """A quarter turn leaves the rows along the axes, one by 10 deg does not."""
+    cells, beside_m = np.array([1 + 2j, -1j, 0]), np.array([3e-4 - 3e-4j, -2e-4 - 4e-4j, 4e-3j])
+    for turn_deg, rows in ((90, 1.0), (10, np.exp(1j * np.deg2rad(10)))):
+        view = replace(WIDE, rotation_rad=np.deg2rad(turn_deg))
+        place = rows * 0.01 * cells
+        offset = np.stack([(place + beside_m).real, (place + beside_m).imag])
+        np.testing.assert_allclose(cells_of(view, offset), cells, atol=1e-12)
+        np.testing.assert_allclose(places_of_cells(view, offset), [place.real, place.imag],
+                                   atol=1e-15)
+
+
+def test_displacements_are_medians_of_a_cell_less_that_on_the_axis():
+    away = np.array([[1, 2, 9, 5, 5, 6, 40], [0, -1, -1, 3, 4, 9, 40]]) * 1e-6
+    number = np.array([7, 7, 7, 2, 2, 2, -1])  # on the axis, in cell 2, beyond the image
+    np.testing.assert_allclose(middles(WIDE, number, away) * 1e6, [
+        [0, 0, 0, 3, 3, 3, 0], [0, 0, 0, 5, 5, 5, 0]], atol=1e-12)
+    assert not middles(WIDE, np.array([1, 2]), away[:, :2]).any()  # none on the axis
+
+
+def test_marks_that_the_cells_show_are_those_seen_from_each_stop():
+    """One by one: stops where a mark of the plate lies in the field, and the cell that sees it."""
+    plate = Artifact(7, 0.01, 0, 5)
+    view = replace(WIDE, rotation_rad=0.0)
+    for cell, sub, shown in zip(view.image.cells, view.sub_views, marks_shown(plate, view),
+                                strict=True):
+        stops = [(m, n) for m in range(-3, 4) for n in range(-2, 3) if -3 <= m + 1 <= 3]
+        expected = {(m + cell[0], n + cell[1]) for m, n in stops}
+        expected = {(m, n) for m, n in expected if abs(m) <= 3 and abs(n) <= 2}
+        assert {(m - 3, n - 2) for m, n in np.argwhere(shown).tolist()} == expected, cell
+        again = np.argwhere(beside(shown, plate, sub, -1)) - (3, 2)
+        assert set(map(tuple, again.tolist())) == {
+            (m - cell[0], n - cell[1]) for m, n in expected}, cell
 
 
 def test_what_is_taken_off_is_exactly_what_the_stops_show():

@@ -113,6 +113,7 @@ def test_a_map_of_one_approach_more_than_the_other_is_moved_to_their_middle():
     moved = axis_figures(stage, 0, 0, biased)
     middle = axis_figures(stage, 0, 0, biased, approach_in_model=True)
     np.testing.assert_allclose(middle.up_m - moved.up_m, -BACKLASH_M[0], atol=1e-12)
+    assert axis_figures(stage, 0, -2, repeats).line_m == pytest.approx(-0.02)
 
 
 def test_the_scatter_of_approaches_is_that_of_the_machine():
@@ -127,6 +128,36 @@ def test_the_scatter_of_approaches_is_that_of_the_machine():
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=4 / np.sqrt(2 * len(off)))
 
 
+def test_the_reversal_of_unequal_approaches_is_that_of_one_least_squares():
+    """Per site: one reversal and a mean a view, from visits of which every third is missing."""
+    _, readings = measured(sigma=30e-9)
+    rng, visits = np.random.default_rng(3), {}
+    fewer = []
+    for view in readings.views:
+        kept = rng.random(len(view.visits.mark)) > 1 / 3
+        own = replace(view.visits, **{name: values[kept]
+                                      for name, values in vars(view.visits).items()
+                                      if np.shape(values) == kept.shape})
+        fewer.append(replace(view, visits=own))
+        x, y = view.view.lattice_pose(ARTIFACT).site_of(view.m, view.n)
+        for mark, value, sign in zip(own.mark, own.dx, own.approach_x, strict=True):
+            visits.setdefault((x[mark], y[mark]), []).append((len(fewer), value, sign))
+    found, unequal = scatters(replace(readings, views=tuple(fewer)), 0), 0
+    assert len(found) >= 20
+    for site, item in found.items():
+        rows = [row for row in visits[site] if row[2]]
+        both = [v for v in {row[0] for row in rows}
+                if {row[2] for row in rows if row[0] == v} == {1, -1}]
+        rows = [row for row in rows if row[0] in both]
+        matrix = np.array([[sign / 2, *(v == view for v in both)] for view, _, sign in rows])
+        inverse = np.linalg.inv(matrix.T @ matrix)
+        value = inverse @ matrix.T @ [value for _, value, _ in rows]
+        assert item.reversal_m == pytest.approx(value[0], abs=1e-15), site
+        assert item.u_reversal_m == pytest.approx(np.sqrt(inverse[0, 0])), site
+        unequal += len({sum(row[2] == sign for row in rows) for sign in (1, -1)}) == 2
+    assert unequal >= 10
+
+
 def solved(seed, truth=None):
     rng = np.random.default_rng(seed)
     plan = hu_plan(ARTIFACT, 2)
@@ -139,12 +170,16 @@ def test_uncertainties_are_the_scatter_of_repeated_calibrations():
     """40 calibrations: a standard deviation is known to 11 %, and lengths have no bias."""
     truth, _ = solved(0)
     exact = StageMap(result_of(replace(random_map(ARTIFACT, 1), gx=truth.g[0], gy=truth.g[1])))
-    z = {"difference": [], "G": [], "M": []}
+    z = {"difference": [], "G": [], "Fmax": [], "Fmin": [], "M": [], "1 M": [], "2 M": []}
     for seed in range(40):
         stage = StageMap(solved(seed, truth)[1])
         stage.halfway = np.zeros((2, 2))  # the truth is bilinear between its nodes
         for name, of in (("difference", lambda s: diagonal_figures(s)[2].figures["length"]),
                          ("G", lambda s: circle_figures(s, 0.03).figures["G"]),
+                         ("Fmax", lambda s: circle_figures(s, 0.03).figures["Fmax"]),
+                         ("Fmin", lambda s: circle_figures(s, 0.03).figures["Fmin"]),
+                         ("1 M", lambda s: diagonal_figures(s)[0].figures["M"]),
+                         ("2 M", lambda s: diagonal_figures(s)[1].figures["M"]),
                          ("M", lambda s: axis_figures(s, 0, 0).figures["M"])):
             figure = of(stage)
             z[name].append((figure.value - of(exact).value) / figure.u)
