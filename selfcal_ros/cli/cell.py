@@ -5,13 +5,11 @@ import argparse
 import json
 import os
 import subprocess
-from pathlib import Path
 
-from selfcal_ros.cli.processes import ended_by_signals, need_ros, process
+from selfcal_ros.cli.processes import ended_by_signals, need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, put, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import read_bytes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +38,7 @@ def run(args: argparse.Namespace) -> int:
         if not 0 <= getattr(args, option) < 1e6:
             raise InputError(f"--{option}", f"{getattr(args, option):g} s is not a waiting time",
                              "give 0 or more")
-    words = ["--ros-args", "--log-level", "warn"]
-    if args.namespace.strip("/"):
-        words += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
-    if args.params:
-        read_bytes(args.params)
-        words += ["--params-file", str(Path(args.params).absolute())]
+    words = [*ros_arguments(args), "--log-level", "warn"]
     items = []
     with ended_by_signals(), process(
             "selfcal_ros.nodes.cell_checker",

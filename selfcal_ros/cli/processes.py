@@ -4,6 +4,7 @@
 Nodes are supervised, the monitor process is read and asked.
 """
 
+import argparse
 import contextlib
 import ctypes
 import fcntl
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_bytes
 from selfcal_ros.start import missing_ros
 
 PR_SET_PDEATHSIG = 1
@@ -40,6 +42,23 @@ def need_ros(alternative: str) -> None:
     missing = missing_ros()
     if missing:
         raise InputError("environment", missing + alternative)
+
+
+def ros_arguments(args: argparse.Namespace) -> list[str]:
+    """Return the ROS arguments for the options ``--namespace`` and ``--params``.
+
+    Raises
+    ------
+    InputError
+        If the parameter file cannot be read.
+    """
+    words = ["--ros-args"]
+    if args.namespace.strip("/"):
+        words += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
+    if args.params:
+        read_bytes(args.params)
+        words += ["--params-file", str(Path(args.params).absolute())]
+    return words
 
 
 @contextlib.contextmanager

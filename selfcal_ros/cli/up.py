@@ -7,11 +7,10 @@ import os
 from pathlib import Path
 
 from selfcal_ros.cli.monitor import watch
-from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros
+from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_ros, ros_arguments
 from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_bytes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -39,25 +38,20 @@ def run(args: argparse.Namespace) -> int:
     """Start and supervise the nodes, show the screen, stop the nodes at the end."""
     need_ros("")
     read_plan(args.plan)
-    if args.params:
-        read_bytes(args.params)
+    nodes = commands(args)
     if args.bag and Path(args.bag).exists():
         raise InputError(args.bag, "exists already", "remove it or name another folder")
     if not Path(args.results).is_dir():
         raise InputError(args.results, "is not a folder", "name one that exists")
     with ended_by_signals(), contextlib.ExitStack() as stack:
-        supervisor = stack.enter_context(Supervisor(commands(args), dict(os.environ)))
+        supervisor = stack.enter_context(Supervisor(nodes, dict(os.environ)))
         monitor = stack.enter_context(eyes(args.namespace))
         return watch(monitor, supervisor.log, supervisor.step, as_json=args.json)
 
 
 def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     """Return node -> its arguments."""
-    common = ["--ros-args"]
-    if args.namespace.strip("/"):
-        common += ["-r", f"__ns:=/{args.namespace.strip('/')}"]
-    if args.params:
-        common += ["--params-file", str(Path(args.params).absolute())]
+    common = ros_arguments(args)
 
     def with_parameters(**values: str) -> list[str]:
         return common + [word for name, value in values.items()

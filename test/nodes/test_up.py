@@ -204,6 +204,7 @@ def test_a_simulated_run_keeps_its_journals_apart(tmp_path, monkeypatch, words, 
 
 def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell.yaml").touch()
     args = build_parser().parse_args(["up", "--plan", "p.yaml", "--params", "cell.yaml"])
     given = up_verb.commands(args)["solver"]
     assert given[:3] == ["--ros-args", "-p", f"save_path:={tmp_path}/p_{{run_id}}.json"]
@@ -297,9 +298,11 @@ def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line
 
 
 def test_marks_are_detected_on_request(tmp_path):
+    params = tmp_path / "n.yaml"
+    params.touch()
     for more, there in (([], False), (["--detect"], True)):
         args = build_parser("up").parse_args(
-            ["up", "--plan", "p.yaml", "--params", "n.yaml", "--results", str(tmp_path), *more])
+            ["up", "--plan", "p.yaml", "--params", str(params), "--results", str(tmp_path), *more])
         nodes = up_verb.commands(args)
         assert ("mark_detector" in nodes) is there
-    assert nodes["mark_detector"][1:] == ["--params-file", str(Path("n.yaml").absolute())]
+    assert nodes["mark_detector"][1:] == ["--params-file", str(params)]
