@@ -15,6 +15,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
+from selfcal_ros.estimation.joint.noise_effects import sensitivities_of_terms
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.pose import Image
@@ -387,10 +388,10 @@ def yaw_of(model: ModelFit, sense: Sense) -> YawMap | None:
     values = taken + inverse @ (
         free.unbiased_sums(now.total) - free.prior(noise.sigma) * taken)
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
-    to_map = centred @ inverse[np.ix_(rows, rows)]
+    to_map = centred @ inverse[rows]
     share = images.noises(model.found.residuals).share
-    covariance = to_map @ centred + share * images.added_covariance(
-        np.tensordot(to_map, images.yaw.residuals[seen], 1))
+    covariance = to_map[:, rows] @ centred + share * images.added_covariance(
+        sensitivities_of_terms(free, to_map))
     covariance *= noise.sigma**2
     yaw, n = centred @ values[rows], len(centred) - 1
     statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw

@@ -17,6 +17,7 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.estimation.datum.covariance import FieldCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
+from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 ADDED = "first_order_added"
@@ -147,6 +148,23 @@ def added_variances(model: ModelFit, cover: FieldCovariance,
             some = unit * np.eye(CHUNK, grid.n_sites, start)[:grid.n_sites - start]
             values[start:start + CHUNK] = of(sensitivities(some))
     return out.reshape(2, *grid.views.shape)
+
+
+def sensitivities_of_terms(equations: TermEquations, to_terms: np.ndarray) -> np.ndarray:
+    """Return sensitivities as `added_variances` takes them, of combinations of the terms' sums.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        Equations of the terms, p columns.
+    to_terms : float array (k, p)
+        The combinations: rows of the covariance of the coefficients for unit noise, or sums of
+        them.
+    """
+    grid, fit = equations.system.grid, equations.projected
+    fields = (to_terms @ fit.fields.T).reshape(-1, *grid.views.shape)
+    return grid.plate(np.tensordot(to_terms, equations.columns.grid, axes=1), fields,
+                      to_terms @ fit.parameters[:3 * grid.n_views].T)[1]
 
 
 def _plate_variances(model: ModelFit, cover: FieldCovariance,

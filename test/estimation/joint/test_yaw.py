@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.camera import yaw_of
@@ -20,8 +21,8 @@ from test.support.truth import Spread, random_truth, simulate_measurements
 
 PITCH = 1e-3
 
-TURNED = 5e-3
-"""Effect of offsets (1 um, noise 60 nm) on columns of a yaw (1 mm) that the draws do not follow."""
+TURNED = 1e-3
+"""Effect of offsets (noise 60 nm) on columns of a yaw (1 mm), from one step to the next."""
 
 
 def of_yaw(measurements):
@@ -80,6 +81,68 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     np.testing.assert_allclose(g, to_map @ y, atol=TURNED * g.std())
     u = np.stack([emap.u_gx, emap.u_gy], axis=-1).ravel()
     np.testing.assert_allclose(u, np.sqrt(np.diag(to_map @ covariance @ to_map.T)), rtol=TURNED)
+
+
+def at_places(matrix, measurements, field):
+    """Return the matrix of `dense` for G where the stage stood: at its indicated place less G.
+
+    G between the sites is the bicubic spline through them; `field` is G, x and y of each site.
+    """
+    out, place, (nx, ny) = matrix.copy(), 0, measurements.artifact.shape
+    along, across = (CubicSpline(np.arange(n), np.eye(n)) for n in (nx, ny))
+    for view in measurements.views:
+        seen = view.visits
+        stood = dict(zip(seen.mark.tolist(), (
+            seen.dx - seen.offset_x + 1j * (seen.dy - seen.offset_y)).tolist(), strict=True))
+        for reading in range(len(view.m)):
+            site = int(out[place, :2 * nx * ny:2].argmax())
+            error = complex(*field[2 * site:2 * site + 2])
+            for _ in range(6):
+                away = (stood[reading] - error) / PITCH
+                weight = np.outer(along(site // ny + away.real), across(site % ny + away.imag))
+                error = complex(*(weight.ravel() @ field.reshape(-1, 2)))
+            for axis in range(2):
+                out[place + axis, axis:2 * nx * ny:2] = weight.ravel()
+            place += 2
+    return out
+
+
+@pytest.mark.parametrize(("stop_m", "image_m", "near"), [
+    (0.0, 3 * MARK, 1e-3), (3e-5, 3 * MARK, 0.015), (3e-5, 0.3 * MARK, 0.015)])
+def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image_m, near):
+    """Plates 30 um beside, stops off the sites; the equations are those of the sites.
+
+    So the estimate is the place at which what the stage's error differs there, taken off, stands
+    still.
+    """
+    plan, rng = image_plan(5, repeats=1), np.random.default_rng(5)
+    truth = random_truth(plan.artifact, 2, rng, Spread(
+        phi_rad=1e-5, t_m=3e-5, stage_yaw_rad=2e-5, rotation="linear", correlation_pitches=4.0))
+    measurements = simulate_measurements(truth, plan, rng, settings=CellSettings(
+        sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m))
+    solved = solve_joint(measurements, Options(
+        assumed=(), terms=(ModelTerm(TermName.YAW),), misalignment_model="linear"))
+    matrix, stops = dense(measurements)
+    whole = np.hstack([matrix, of_yaw(measurements) / PITCH])
+    inverse, sites = np.linalg.pinv(whole, rcond=1e-10), np.prod(plan.artifact.shape)
+    project = datum(plan.artifact)
+    y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
+    field = project @ inverse[:2 * sites] @ y
+    for _ in range(4):
+        moved = np.zeros_like(whole)
+        moved[:, :2 * sites] = (at_places(matrix, measurements, field) - matrix)[
+            :, :2 * sites] @ project
+        estimate = np.linalg.solve(np.eye(len(inverse)) + inverse @ moved, inverse)
+        field = project @ estimate[:2 * sites] @ y
+    emap, yaw = solved.result.error_map, yaw_of(solved.model, measurements.sense)
+    np.testing.assert_allclose(np.stack([emap.gx, emap.gy], axis=-1).ravel(), field,
+                               atol=1e-3 * emap.u_gx.mean())
+    noises = solved.model.problem.images.noises(solved.model.found.residuals)
+    covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
+        stops[:, None] == stops, np.eye(2))
+    to_yaw = (np.eye(sites) - 1 / sites) @ estimate[-sites:] / PITCH
+    np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=1e-3 * yaw.u.mean())
+    np.testing.assert_allclose(yaw.u, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)), rtol=near)
 
 
 def test_only_a_constant_yaw_is_the_cameras():
