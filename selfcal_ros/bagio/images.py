@@ -258,6 +258,16 @@ class ImageBag:
                 yield item
             self.lost.update(lines)
 
+    def cdr_images(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield the topic's name of the contract, log time in ns and CDR bytes of each image.
+
+        Undecodable ones are omitted and counted.
+        """
+        role = self.topic.removeprefix(self.space)
+        for item in self.items():
+            if item.image is not None:
+                yield role, item.message.log_time, item.message.data
+
     def _decoded(self, channel: Channel, schema: Schema | None, message: Message) -> Any:
         name = schema.name if schema else self._kind
         if name != self._kind:

@@ -2,13 +2,16 @@
 """A bag into the collector without middleware, and in the order of replay."""
 
 import hashlib
+import heapq
 from array import array
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.clock_steps import step_lines
 from selfcal_ros.collection.collector import Collector, keep_freed_memory
@@ -35,7 +38,7 @@ FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
 MAX_SAID = 3
 """Number of lines on losses repeated in an error."""
 TRUTH_FILE = "truth.json"
-TOPICS = list(INPUT_TOPICS)
+TOPICS = [*INPUT_TOPICS, *IMAGE_TOPICS.values()]
 
 
 class BagSession(NamedTuple):
@@ -189,7 +192,7 @@ def read_truth(bag: str | Path) -> dict | None:
 
 
 class Playlist:
-    """The input topics of a bag as CDR bytes, by log time or shuffled.
+    """The input topics of a bag, or images for detections, as CDR bytes, by log time or shuffled.
 
     A bag in the order of its log times, as written by recorders, is read again while it is
     played; any other one is kept in memory.
@@ -202,6 +205,8 @@ class Playlist:
         Namespace of the cell in the bag, None = the only one.
     seed : int
         Shuffles the order of arrival, not the times; negative = as recorded.
+    with_images : bool
+        Whether a bag without detections shows its marks by its images.
 
     Attributes
     ----------
@@ -211,20 +216,27 @@ class Playlist:
         Topic -> number of messages, without topics that have none.
     """
 
-    def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1) -> None:
+    def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1, *,
+                 with_images: bool = False) -> None:
         self._bag, self._namespace = bag, namespace
         reader = BagReader(bag, namespace)
-        times, topics = _times_and_topics(reader)
+        times, topics = _times_and_topics(reader.cdr_messages())
         self._leave_ahead = reader.mixes_clocks
         if self._leave_ahead:
             reader = self._reader()
-            times, topics = _times_and_topics(reader)
+            times, topics = _times_and_topics(reader.cdr_messages())
         self.lost = [*reader.lost, *reader.future_lines()]
+        self._has_images = self._shows_images(reader, with_images, DETECTION_TOPIC in {
+            TOPICS[number] for number in set(topics)})
+        if self._has_images:
+            images = ImageBag(bag, namespace)
+            times, topics = _times_and_topics(self._messages(images))
+            self.lost += [f"{count} {line}" for line, count in images.lost.items()
+                          if line not in reader.lost]
         self._times = np.array(times, dtype=np.uint64)
         numbers, counts = np.unique(np.array(topics, dtype=np.uint8), return_counts=True)
         self.counts = {TOPICS[number]: int(count)
                        for number, count in zip(numbers, counts, strict=True)}
-        self._note_images(reader)
         sorted_already = bool((self._times[1:] >= self._times[:-1]).all())
         order = None if sorted_already else np.argsort(self._times, kind="stable")
         self._times = self._times if order is None else self._times[order]
@@ -233,15 +245,32 @@ class Playlist:
             order = mixed if order is None else order[mixed]
         self._order = order
 
-    def _note_images(self, reader: BagReader) -> None:
-        """Tell of images, which are not played; refuse a bag with nothing else to show marks."""
+    def _shows_images(self, reader: BagReader, with_images: bool, has_detections: bool) -> bool:
+        """Return whether images are played; say of others that they are not.
+
+        Raises
+        ------
+        InputError
+            If nothing else shows marks.
+        """
         images = [topic for topic in reader.topics
                   if f"/{topic}".endswith(tuple(f"/{role}" for role in IMAGE_TOPICS.values()))]
+        if not images or (with_images and not has_detections):
+            return bool(images)
         what, remedy = f"images on {', '.join(images)} are not played", (
             f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them")
-        if images and DETECTION_TOPIC not in self.counts:
+        if not has_detections:
             raise InputError(str(self._bag), f"{what}, and there are no detections", remedy)
-        self.lost += [f"{what}: {remedy}"] if images else []
+        self.lost.append(f"{what}: {remedy}")
+        return False
+
+    def _messages(self, images: ImageBag | None = None) -> Iterable[tuple[str, int, bytes]]:
+        """Return all messages, in the order of their times if the bag is."""
+        messages = self._reader().cdr_messages()
+        if not self._has_images:
+            return messages
+        images = images or ImageBag(self._bag, self._namespace)
+        return heapq.merge(messages, images.cdr_images(), key=itemgetter(1))
 
     def _reader(self) -> BagReader:
         return BagReader(self._bag, self._namespace, leave_ahead=self._leave_ahead)
@@ -252,7 +281,7 @@ class Playlist:
 
     def __iter__(self) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, log time in ns, and CDR bytes."""
-        messages = self._reader().cdr_messages()
+        messages = self._messages()
         if self._order is None:
             yield from messages
             return
@@ -262,10 +291,10 @@ class Playlist:
             yield topic, stamp, data
 
 
-def _times_and_topics(reader: BagReader) -> tuple[array, array]:
+def _times_and_topics(messages: Iterable[tuple[str, int, bytes]]) -> tuple[array, array]:
     """Return the log time of each message, and the index of its topic."""
     times, topics = array("Q"), array("B")
-    for topic, stamp, _ in reader.cdr_messages():
+    for topic, stamp, _ in messages:
         times.append(stamp)
         topics.append(TOPICS.index(topic))
     return times, topics

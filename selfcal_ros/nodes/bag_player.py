@@ -29,7 +29,8 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         self.exit_code = ExitCode.DONE
         listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
         self.player = Player(self, self.settings.bag, rate=self.settings.rate,
-                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE)
+                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE,
+                             with_images=True)
         self._patience = time.monotonic() + patience_s
         self._started = not listener or not patience_s
         self.every(0.002, self._step)
@@ -38,7 +39,8 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         """Return the progress, and the node it waits for."""
         level, line = Level.OK, "playing"
         if not self._started:
-            level, line = Level.WARN, f"waiting for {self.player.listener}"
+            level, line = Level.WARN, "waiting for " + (
+                self.player.listener if self.player.unheard() else self.player.detector)
         elif self.player.stalled_s > STALLED_S:
             level, line = Level.WARN, f"{self.player.listener} takes no more messages"
         return Diagnosis(level, line, {"played": self.player.played, "total": self.player.total})
@@ -63,13 +65,15 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             self.finished.set_result(None)
 
     def _is_heard(self) -> bool:
-        unheard = self.player.unheard()
-        if unheard and time.monotonic() > self._patience:
+        missing = [f"{node} does not listen to {', '.join(topics)}" for node, topics in (
+            (self.player.listener, self.player.unheard()),
+            (self.player.detector, self.player.unseen())) if topics]
+        if missing and time.monotonic() > self._patience:
             raise InputError(
-                "bag_player", f"{self.player.listener} does not listen to {', '.join(unheard)} "
+                "bag_player", f"{' and '.join(missing)} "
                 f"after {self.settings.wait_for_subscribers:g} s, nothing was played", "start it, "
                 "name another node as listener, or set listener to '' to wait for nobody")
-        return not unheard
+        return not missing
 
 
 def main() -> None:

@@ -34,6 +34,8 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
     def configure(self) -> None:
         """Create the session and the publisher."""
         publish = self.output(names.DETECTIONS)
+        self._received = self.publisher(names.private(names.RECEIVED))
+        self._taken = 0
         self.session = DetectingSession(self.settings, self.ports(
             lambda output, fields: publish(fields)))
 
@@ -46,9 +48,17 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         images = ByTheClock(topics[0].name, self.guarded(self._take, topics[0].name), lambda: None)
         self._input = MatchedInput(self, topics, images, raw=True)
         self.every(TICK_S, self._look)
+        self._tell_taken()
 
     def _take(self, data: bytes, _received_ns: int) -> None:
-        self.session.take(deserialize_message(data, self._kind))
+        self._taken += 1
+        try:
+            self.session.take(deserialize_message(data, self._kind))
+        finally:
+            self._tell_taken()
+
+    def _tell_taken(self) -> None:
+        self._received.publish(names.RECEIVED.type(data=[self._taken]))
 
     def _look(self) -> None:
         """Take a few waiting images, and count the lost ones by their numbers."""

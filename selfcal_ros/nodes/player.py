@@ -12,16 +12,23 @@ from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 
 from selfcal_ros.bagio.offline import Playlist
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS
 from selfcal_ros.units import S_PER_NS
 
 KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
+IMAGES = "image"
+KINDS_OF_ALL = KINDS | dict.fromkeys(IMAGE_TOPICS.values(), IMAGES)
 WINDOW = 1500
 """Largest number of messages on the way to the collector, well below its queue depth."""
+WAITING_IMAGES = 4
+"""Largest number of images on the way to the detector, below the number that it lets wait."""
+IMAGE_DEPTH = 32
+"""Images kept for subscribers that have not acknowledged them."""
 BURST, SLICE_S = 100, 0.02
 """Messages between checks of the time and of the subscribers' progress; longest step."""
 UNHEARD_RATE = 4000
@@ -34,23 +41,30 @@ class Player:
     Messages are sent as the bytes in the bag, or re-encoded if its types have other
     trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
     `namespace` is that of the cell in the bag, None = the only one; `listener` is the node that
-    sets the pace.
+    sets the pace. With `with_images` images take the place of missing detections, at the pace of
+    mark_detector in the node's namespace.
     """
 
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
-                 namespace: str | None = None, listener: str = CollectorSettings.NODE) -> None:
+                 namespace: str | None = None, listener: str = CollectorSettings.NODE,
+                 with_images: bool = False) -> None:
         self.node, self.rate, self._bag = node, rate, bag
         own = node.get_namespace().rstrip("/")
         self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
-        self.playlist = Playlist(Path(bag), namespace, seed)
+        self.detector = f"{own}/{DetectorSettings.NODE}"
+        self.playlist = Playlist(Path(bag), namespace, seed, with_images=with_images)
         if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
         self._messages = iter(self.playlist)
         first = next(self._messages)
         self._next: tuple[str, int, bytes] | None = first
         self._first_ns = first[1]
-        self._publishers = {topic.name: node.publisher(topic) for topic in names.INPUTS}
-        self.sent = dict.fromkeys(KINDS.values(), 0)
+        images = [names.image_topics(transport, IMAGE_DEPTH)[0] for transport, topic
+                  in IMAGE_TOPICS.items() if topic in self.playlist.counts]
+        # detections of images are the detector's
+        played = [topic for topic in names.INPUTS if not images or topic.name != DETECTION_TOPIC]
+        self._publishers = {topic.name: node.publisher(topic) for topic in (*played, *images)}
+        self.sent = dict.fromkeys([KINDS_OF_ALL[name] for name in self._publishers], 0)
         self.heard: dict[str, int] | None = None
         self._at = 0
         self._began: float | None = None
@@ -59,6 +73,14 @@ class Player:
         received = names.of_node(self.listener, names.RECEIVED)
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
+        if images:
+            taken = names.of_node(self.detector, names.RECEIVED)
+            self._detector_tells = partial(node.count_publishers, taken.name)
+            node.subscribe(taken, self._on_taken)
+
+    taken: int | None = None
+    """Images that the detector has taken."""
+    _taken_before = 0
 
     @property
     def total(self) -> int:
@@ -81,26 +103,35 @@ class Player:
         Other subscribers (ros2 topic echo, foxglove_bridge) do not count; a collector that
         subscribes with best effort, because another publisher offers no more, would lose messages.
         """
-        if self.heard is None and self._tells():
-            return list(self.playlist.counts)
-        hears = {topic: self._hears(publisher) for topic, publisher in self._publishers.items()
-                 if topic in self.playlist.counts}
+        played = [topic for topic in self.playlist.counts if topic in KINDS]
+        waits = self.heard is None and self._tells()
+        return played if waits else self._not_heard(played, self.listener)
+
+    def unseen(self) -> list[str]:
+        """Return the topics of images to play that the detector has not subscribed to yet."""
+        played = [topic for topic in self.playlist.counts if topic not in KINDS]
+        waits = played and self.taken is None and self._detector_tells()
+        return played if waits else self._not_heard(played, self.detector)
+
+    def _not_heard(self, topics: list[str], by: str) -> list[str]:
+        hears = {topic: self._hears(self._publishers[topic], by) for topic in topics}
         return [topic + (" reliably (another publisher offers best effort)" if found else "")
                 for topic, found in hears.items() if ReliabilityPolicy.RELIABLE not in found]
 
-    def _hears(self, publisher: Publisher) -> list[ReliabilityPolicy]:
-        """Return the reliabilities requested by the subscriptions of `listener` to a publisher."""
+    def _hears(self, publisher: Publisher, by: str) -> list[ReliabilityPolicy]:
+        """Return the reliabilities requested by the subscriptions of a node to a publisher."""
         if not publisher.get_subscription_count():
             return []
         readers = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
-        return [reader.qos_profile.reliability for reader in readers if self.listener
-                == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
+        return [reader.qos_profile.reliability for reader in readers
+                if by == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
 
     def step(self) -> None:
         """Publish the messages due now."""
         now = time.monotonic()
         if self._began is None:
-            self._began, self._before = now, sum((self.heard or {}).values())
+            self._began, self._before = now, self._received
+            self._taken_before = self.taken or 0
         played_ns = (now - self._began) * self.rate / S_PER_NS
         due_ns = self._first_ns + played_ns if self.rate > 0 else math.inf
         while not self.done and (instant := time.monotonic()) < now + SLICE_S:
@@ -127,23 +158,39 @@ class Player:
             if stamp > due_ns:
                 return False
             self._publishers[topic].publish(data)
-            self.sent[KINDS[topic]] += 1
+            self.sent[KINDS_OF_ALL[topic]] += 1
             self._at += 1
             self._next = next(self._messages, None)
         return True
 
     def _room(self, played_s: float) -> int:
         """Return the number of messages that subscribers can take, `played_s` after the first."""
-        if self.heard is None:
-            return int(WINDOW + UNHEARD_RATE * played_s / 2) - self._at
-        return WINDOW - self._at + sum(self.heard.values()) - self._before
+        images = self.sent.get(IMAGES, 0)
+        others = self._at - images
+        room = WINDOW - others + (int(UNHEARD_RATE * played_s / 2) if self.heard is None
+                                  else self._received - self._before)
+        if self.taken is None:
+            return room
+        return min(room, WAITING_IMAGES - images + self.taken - self._taken_before)
+
+    @property
+    def _received(self) -> int:
+        """Number of messages of the kinds played here that the listener has received."""
+        return sum(count for kind, count in (self.heard or {}).items() if kind in self.sent)
 
     def _on_received(self, message: Any) -> None:
-        if len(message.data) != len(self.sent):
+        if len(message.data) != len(KINDS):
             return
-        if sum(message.data) < sum((self.heard or {}).values()):  # a listener that was restarted
-            self._before = sum(message.data) - self._at
-        self.heard = dict(zip(self.sent, map(int, message.data), strict=True))
+        before = self._received
+        self.heard = dict(zip(KINDS.values(), map(int, message.data), strict=True))
+        if self._received < before:  # a listener that was restarted
+            self._before = self._received - self._at + self.sent.get(IMAGES, 0)
+
+    def _on_taken(self, message: Any) -> None:
+        taken = int(sum(message.data))
+        if taken < (self.taken or 0):  # a detector that was restarted
+            self._taken_before = taken - self.sent[IMAGES]
+        self.taken = taken
 
     def drain(self) -> None:
         """Wait until everything has been acknowledged."""

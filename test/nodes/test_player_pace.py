@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import pytest
 
 from selfcal_ros.nodes import player
-from selfcal_ros.nodes.player import KINDS, WINDOW, Player
+from selfcal_ros.nodes.player import IMAGES, KINDS, WAITING_IMAGES, WINDOW, Player
 
 T0 = 1_700_000_000_000_000_000
 
 
-def player_of(count: int, sent: list, rate: float) -> Player:
+def player_of(count: int, sent: list, rate: float, topic: str = next(iter(KINDS))) -> Player:
     """Return a player of so many messages, a second apart; what it publishes goes to `sent`."""
-    topic, played = next(iter(KINDS)), Player.__new__(Player)
+    played = Player.__new__(Player)
     messages = iter([(topic, T0 + number * 10**9, number) for number in range(count)])
     for name, value in {"playlist": range(count), "_at": 0, "_began": None, "rate": rate,
                         "_messages": messages, "_next": next(messages), "_first_ns": T0,
@@ -75,3 +75,16 @@ def test_a_listener_that_is_restarted_is_sent_the_rest(monkeypatch):
     tell(played, WINDOW)
     played.step()
     assert (len(sent), played.done, played.stalled_s) == (3 * WINDOW, True, 0.0)
+
+
+def test_images_are_sent_as_the_detector_takes_them(monkeypatch):
+    """One that has taken others before, and is restarted after two of these."""
+    monkeypatch.setattr(player.time, "monotonic", lambda: 70.0)
+    sent: list = []
+    played = player_of(20, sent, rate=0.0, topic="stage/image")
+    played.sent = {IMAGES: 0}
+    for taken, total in ((30, WAITING_IMAGES), (30, WAITING_IMAGES), (32, WAITING_IMAGES + 2),
+                         (0, 2 * WAITING_IMAGES + 2), (3, 2 * WAITING_IMAGES + 5)):
+        played._on_taken(SimpleNamespace(data=[taken]))
+        played.step()
+        assert len(sent) == total == played.sent[IMAGES]

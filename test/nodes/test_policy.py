@@ -62,6 +62,9 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
     found["topics", "subscribe"] |= {"/clock"}  # with use_sim_time
     if node == "mark_detector":  # with transport compressed
         found["topics", "subscribe"] |= {"/stage/image/compressed"}
+    if node == "bag_player":  # with images for detections
+        found["topics", "publish"] |= {"/stage/image", "/stage/image/compressed"}
+        found["topics", "subscribe"] |= {"/mark_detector/received"}
     return found | {("actions", "execute"): actions}
 
 
