@@ -6,11 +6,12 @@ an MCAP file (https://mcap.dev/spec), without reading its messages.
 """
 
 import hashlib
+import itertools
 import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -92,7 +93,7 @@ def bag_files(path: Path) -> list[Path]:
 
 
 def attachments(files: list[Path]) -> dict[str, bytes]:
-    """Return the attachments of MCAP files by name.
+    """Return the attachments of MCAP files by name; further ones of a name as "NAME (2)".
 
     Raises
     ------
@@ -106,11 +107,17 @@ def attachments(files: list[Path]) -> dict[str, bytes]:
             try:
                 for body in (body for opcode, body in records_in(text, path) if opcode == INDEX):
                     raw = _attachment(file, *struct.unpack_from("<QQ", body))
-                    out[_text(raw, 16)[0]] = _content(raw)
+                    out[unused(_text(raw, 16)[0], out)] = _content(raw)
             except (struct.error, ValueError) as error:
                 raise InputError(str(path), "an attachment is damaged", "embed the file again into "
                                  "a copy of the recording") from error
     return out
+
+
+def unused(name: str, taken: Container[str]) -> str:
+    """Return a name, with a number behind it if it is taken."""
+    numbered = (f"{name} ({number})" for number in itertools.count(2))
+    return next(one for one in itertools.chain([name], numbered) if one not in taken)
 
 
 def _attachment(file: BinaryIO, place: int, count: int) -> bytes:

@@ -6,6 +6,7 @@ is written anew.
 """
 
 import io
+import os
 import struct
 import zlib
 from collections.abc import Sequence
@@ -76,11 +77,15 @@ def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns
     Raises
     ------
     InputError
-        If the file has no summary, or an attachment of this name.
+        If the file has no summary, has an attachment of this name, or is written to meanwhile.
     """
     path = BagReader(Path(bag)).files[0]
+    state = _state(path)
     taken = set(attached(bag))
     for name, *_ in items:
+        if not name.isprintable():  # nor are bytes that are no UTF-8
+            raise InputError(f"{bag}: {name!a}", "has characters that cannot be printed",
+                             "rename the file")
         if name in taken:
             raise InputError(f"{bag}: {name}", "is in the bag already",
                              "give the file another name, or take a copy of the recording")
@@ -98,11 +103,23 @@ def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns
         out.write(records(DataEnd(0)))
         more: list[McapRecord] = list(index)
         if summary.statistics is not None:
-            more.append(replace(summary.statistics, attachment_count=len(index)))
+            count = summary.statistics.attachment_count + len(items)  # some may have no index
+            more.append(replace(summary.statistics, attachment_count=count))
         text, start = summary.others + records(*more), out.tell()
         crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0),
                          zlib.crc32(text))
         out.write(text + records(Footer(start, 0, crc)) + MAGIC)
+        out.flush()
+        os.fsync(out.fileno())  # takes its time: before the last look at the file
+        if _state(path) != state:
+            raise InputError(str(path), "another program has written to it meanwhile",
+                             "embed again")
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Return what changes when a file is written or replaced."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _copy(file: BinaryIO, out: BinaryIO, size: int) -> None:

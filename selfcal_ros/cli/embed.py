@@ -3,8 +3,9 @@
 
 import argparse
 import mimetypes
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from selfcal_ros.bagio.attachments import attach, attached
@@ -15,6 +16,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes, read_json
 from selfcal_ros.model.result import SCHEMA, result_from_dict
 from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.results import unused
 
 KINDS = {".json": "application/json", ".yaml": "application/yaml", ".xml": "application/xml"}
 """Ending -> media type, where the system's table may lack it."""
@@ -42,8 +44,12 @@ def run(args: argparse.Namespace) -> int:
         attach(args.bag, items, time.time_ns())
     found = attached(args.bag)
     if args.extract:
-        names = [str(Path(args.extract, Path(name).name)) for name in found]
+        names = [str(Path(args.extract, name)) for name in file_names(found)]
         check_outputs([args.bag], names)
+        for name, data in zip(names, found.values(), strict=True):
+            if Path(name).exists() and read_bytes(name) != data:
+                raise InputError(name, "the file exists and has other content",
+                                 "extract to an empty folder")
         for name, data in zip(names, found.values(), strict=True):
             write_bytes(name, data)
     lines = [f"{name}: {len(data)} bytes" for name, data in found.items()]
@@ -51,6 +57,15 @@ def run(args: argparse.Namespace) -> int:
         "bag": args.bag, "extracted": args.extract or "",
         "attachments": [{"name": name, "bytes": len(data)} for name, data in found.items()]})
     return 0
+
+
+def file_names(names: Iterable[str]) -> list[str]:
+    """Return different names of files in one folder for names of attachments."""
+    out: list[str] = []
+    for name in names:
+        last = "".join(c if c.isprintable() else "_" for c in re.split(r"[\\/]", name)[-1])
+        out.append(unused("attachment" if last in ("", ".", "..") else last, out))
+    return out
 
 
 def with_records(names: Sequence[str]) -> list[str]:

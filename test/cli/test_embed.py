@@ -2,11 +2,14 @@
 """``selfcal embed``: files in the bag and out again; the messages stay as they are."""
 
 import json
+import os
 import shutil
 
 import pytest
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 
+from selfcal_ros.bagio import attachments
 from selfcal_ros.bagio.attachments import attach, attached
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
@@ -124,3 +127,108 @@ def test_files_and_extract_exclude_each_other(bag, capsys):
     assert "files are named, too" in capsys.readouterr().err
     assert main(["embed", str(bag / "missing")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def foreign(path, names=(), **how):
+    """Write a file with the mcap library alone: 300 messages, metadata, attachments."""
+    with path.open("wb") as file:
+        writer = Writer(file, **how)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        channel = writer.register_channel("/t", "json", schema)
+        for n in range(300):
+            writer.add_message(channel, n, b"%d" % n, n)
+        for number, name in enumerate(names):
+            writer.add_attachment(1, 1, name, "text/plain", b"%d" % number)
+        writer.add_metadata("meta", {"k": "v"})
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("how", [
+    {"compression": CompressionType.NONE}, {"compression": CompressionType.LZ4},
+    {"compression": CompressionType.ZSTD}, {"use_chunking": False}, {"enable_crcs": False},
+    {"enable_data_crcs": True}, {"use_summary_offsets": False}, {"chunk_size": 100},
+    {"index_types": IndexType.NONE}], ids=str)
+def test_files_of_another_writer_are_kept_whole(tmp_path, how):
+    """Messages, metadata and attachments, also those that its index does not name."""
+    path = foreign(tmp_path / "a.mcap", ["x.txt"], **how)
+    before = path.read_bytes()
+    attach(path, [("größe µ.txt", "text/plain", b"new")], 5)
+    now = path.read_bytes()
+    assert now.startswith(before[:before.rindex(b"\x0f" + (4).to_bytes(8, "little"))])  # DataEnd
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True)
+        assert [m.data for _, _, m in reader.iter_messages()] == [b"%d" % n for n in range(300)]
+    with path.open("rb") as file:
+        found = [(a.name, a.data) for a in NonSeekingReader(file).iter_attachments()]
+    assert found == [("x.txt", b"0"), ("größe µ.txt", b"new")]
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary().statistics.attachment_count == 2
+    assert attached(path)["größe µ.txt"] == b"new"
+
+
+def test_a_file_without_any_summary_is_left_alone(tmp_path):
+    path = foreign(tmp_path / "a.mcap", use_statistics=False, use_summary_offsets=False,
+                   index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="no MCAP file with a summary"):
+        attach(path, [("a", "", b"")], 1)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("others", ["attach", "append"])
+def test_what_another_program_writes_meanwhile_is_not_lost(bag, monkeypatch, others):
+    """Two at once: the second that ends is refused, and the first is in the bag."""
+    copy, path = attachments._copy, file_in(bag)
+
+    def meanwhile(*args):
+        copy(*args)
+        monkeypatch.setattr(attachments, "_copy", copy)
+        if others == "attach":
+            attach(bag, [("first.txt", "", b"1")], 1)
+        else:
+            with path.open("ab") as file:
+                file.write(b"more")
+    monkeypatch.setattr(attachments, "_copy", meanwhile)
+    with pytest.raises(InputError, match="another program has written to it meanwhile; embed ag"):
+        attach(bag, [("second.txt", "", b"2")], 2)
+    if others == "attach":
+        attach(bag, [("second.txt", "", b"2")], 3)
+        assert attached(bag) == {"first.txt": b"1", "second.txt": b"2"}
+    else:
+        assert path.read_bytes().endswith(b"more")
+    assert [one.name for one in bag.glob(".*")] == []  # nothing is left behind
+
+
+def test_attachments_of_any_names_come_out_as_different_files_of_one_folder(tmp_path):
+    names = ["x.txt", "x.txt", "../x.txt", "", "..", "a/b\\c", "n\0l\n", "x.txt (2)"]
+    path, out = foreign(tmp_path / "a.mcap", names), tmp_path / "out"
+    out.mkdir()
+    assert main(["embed", str(path), "--extract", str(out)]) == 0
+    assert {one.name: int(one.read_bytes()) for one in out.iterdir()} == {
+        "x.txt": 0, "x.txt (2)": 1, "x.txt (3)": 2, "attachment": 3, "attachment (2)": 4, "c": 5,
+        "n_l_": 6, "x.txt (2) (2)": 7}
+    assert {one.name for one in tmp_path.iterdir()} == {"a.mcap", "out"}
+
+
+def test_a_file_with_other_content_is_not_written_over(tmp_path, capsys):
+    path, out = foreign(tmp_path / "a.mcap", ["x.txt", "y.txt"]), tmp_path / "out"
+    out.mkdir()
+    (out / "y.txt").write_text("newer")
+    assert main(["embed", str(path), "--extract", str(out)]) == 2
+    assert "y.txt: the file exists and has other content; extract to" in capsys.readouterr().err
+    assert (out / "y.txt").read_text() == "newer" and not (out / "x.txt").exists()
+    (out / "y.txt").write_bytes(b"1")
+    assert main(["embed", str(path), "--extract", str(out)]) == 0
+
+
+@pytest.mark.parametrize("name", [b"bad\xff.txt", b"two\nlines"])
+def test_a_name_that_cannot_be_printed_is_one_line(bag, tmp_path, capsys, name):
+    path = tmp_path / os.fsdecode(name)
+    path.write_text("x")
+    before = file_in(bag).read_bytes()
+    assert main(["embed", str(bag), str(path)]) == 2
+    err = capsys.readouterr().err
+    assert "has characters that cannot be printed; rename the file" in err and err.count("\n") == 1
+    assert file_in(bag).read_bytes() == before
