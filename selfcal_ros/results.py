@@ -85,8 +85,8 @@ def bag_files(path: Path) -> list[Path]:
         if path.is_dir():
             return sorted(path.glob("*.mcap"))
         if path.is_file():
-            with path.open("rb") as file:
-                return [path] * (file.read(len(MAGIC)) == MAGIC)
+            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+                return [path] * (file.read(len(MAGIC)) == MAGIC)  # None: it would have to wait
     except (OSError, ValueError):
         pass  # whoever reads it says why not
     return []

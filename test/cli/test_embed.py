@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``selfcal embed``: files in the bag and out again; the messages stay as they are."""
 
+import contextlib
 import json
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
@@ -13,6 +15,7 @@ from selfcal_ros.bagio import attachments
 from selfcal_ros.bagio.attachments import attach, attached
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
+from selfcal_ros.results import bag_files
 from test.support.pages import ROOT
 
 
@@ -232,3 +235,15 @@ def test_a_name_that_cannot_be_printed_is_one_line(bag, tmp_path, capsys, name):
     err = capsys.readouterr().err
     assert "has characters that cannot be printed; rename the file" in err and err.count("\n") == 1
     assert file_in(bag).read_bytes() == before
+
+
+@pytest.mark.skipif(not os.access("/proc/kmsg", os.R_OK), reason="needs the log of the kernel")
+def test_a_file_that_gives_nothing_yet_is_not_waited_for():
+    log = os.open("/proc/kmsg", os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with contextlib.suppress(BlockingIOError):
+            while os.read(log, 8192):
+                pass
+        assert bag_files(Path("/proc/kmsg")) == []
+    finally:
+        os.close(log)
