@@ -33,6 +33,12 @@ MANY = 5.0
 ALIKE = 0.3
 """Correlation of neighbours below which differences are of marks, not of a stage."""
 
+BY_CHANCE = 3.5
+"""Part of differences that neighbours may by chance not share, over the root of their number."""
+
+BY_CHANCE_BETTER = 8.0
+"""Gain of the log-likelihood that one of all poses may have by chance, over the same root."""
+
 LEAST = 0.01
 """Part of the known errors of the marks by which those of another plate differ at least."""
 
@@ -41,6 +47,12 @@ STEPS = 6
 
 NEIGHBOURS = 1.3
 """Largest distance of neighbouring marks, in pitches."""
+
+DISTANCES = ((0.7, 1.2), (1.2, 1.7), (1.7, 2.2))
+"""Distances at which differences are compared, in pitches."""
+
+FAR = 3.0
+"""Length of a difference, in standard deviations, beyond which it is of a single mark."""
 
 PLANNED = (1 + 0j, 0j)
 """No further turn, no further shift."""
@@ -112,7 +124,7 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
         other = _other_pose(seen, plate.field, measurements.artifact)
         if other is not None:
             raise said(_misplaced(view, seen, other), f"plan '{measurements.plan_id}', ")
-        if many > MANY and _neighbours(seen.marks[here], rest) < ALIKE:
+        if many > MANY and _of_marks(seen.marks[here], rest, seen.u):
             return Finding("other_plate", _size(rest), seen.u, "m",
                            view=view.view.name, details={"times": many, "of": plate.where})
     return None
@@ -152,7 +164,8 @@ def _other_pose(seen: _Read, plate: np.ndarray,
         tried.append((2 * len(here[0]) * float(np.log(before / after)), pose))
     tried.sort(key=lambda item: -item[0])
     second = tried[1][0] if len(tried) > 1 else 0.0
-    if not tried or tried[0][0] < BETTER or tried[0][0] - second < CLEARLY:
+    least = max(BETTER, BY_CHANCE_BETTER * np.sqrt(len(seen.marks)))
+    if not tried or tried[0][0] < least or tried[0][0] - second < CLEARLY:
         return None
     return tried[0][1]
 
@@ -172,9 +185,33 @@ def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -
                      (planned[0], planned[1]), (found[0], found[1]))
 
 
+def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
+    """Return whether what is left is of the marks, not of a stage alone, which changes smoothly."""
+    own, least = _not_shared(marks, rest), BY_CHANCE / np.sqrt(len(marks))
+    return _neighbours(marks, rest) < ALIKE or own > max(MANY * u, least * _size(rest))
+
+
 def _neighbours(marks: np.ndarray, rest: np.ndarray) -> float:
     """Return the correlation of what is left at neighbouring marks."""
     away = np.abs(marks[:, None] - marks)
     first, other = np.nonzero((away > 0) & (away < NEIGHBOURS))
     products = (rest[first] * rest[other].conj()).real
     return float(products.mean() / np.mean(np.abs(rest)**2)) if len(products) else 1.0
+
+
+def _not_shared(marks: np.ndarray, rest: np.ndarray) -> float:
+    """Return the standard deviation, of a component, of what no neighbour shares; 0 if unknown.
+
+    Half the mean squares of differences at 1, 1.4 and 2 pitches, continued to no distance by a
+    parabola in its square. Single marks that are far off count as far off as others.
+    """
+    size = np.maximum(np.abs(rest) / (FAR * _size(rest)), 1.0)
+    away, rest, means = np.abs(marks[:, None] - marks), rest / size, []
+    for nearest, farthest in DISTANCES:
+        first, other = np.nonzero((away > nearest) & (away < farthest))
+        if len(first) < len(marks):
+            return 0.0
+        square = np.mean(away[first, other] ** 2)
+        means.append((1.0, square, square**2, np.mean(np.abs(rest[first] - rest[other])**2) / 4))
+    of = np.array(means)
+    return float(np.sqrt(max(np.linalg.solve(of[:, :3], of[:, 3])[0], 0.0)))

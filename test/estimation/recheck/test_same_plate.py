@@ -9,6 +9,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError
+from selfcal_ros.estimation.recheck import same_plate
 from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
@@ -84,6 +85,27 @@ def test_another_plate_is_not_a_changed_stage(sense):
     assert result.verdict.grade is Grade.NOT_QUALIFIED and not result.findings
     assert "another plate, or the plate has changed" in result.verdict.sentence
     assert "check which plate it is" in result.verdict.sentence
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_another_machine_with_another_plate_is_not_a_changed_stage(seed):
+    """The stages differ smoothly, as much as the plates do from mark to mark; no pose is named."""
+    _, plate = calibrated(Sense.MICROSCOPE_MOVES)
+    other = random_truth(ARTIFACT, 1, np.random.default_rng(seed), Spread(correlation_pitches=4.0))
+    size = np.std(other.g) / np.std(other.a)
+    result = recheck(once_more(Sense.MICROSCOPE_MOVES, g=other.g, a=size * other.a), BARE, plate)
+    assert [found.name for found in result.verdict.failed] == ["other_plate"]
+
+
+def test_what_neighbours_do_not_share_is_found_beneath_a_smooth_field():
+    """A parabola has none of it; a unit of each mark by itself is found to its scatter."""
+    half, rng = np.arange(-7.0, 8.0), np.random.default_rng(1)
+    z = (half[:, None] + 1j * half).ravel()
+    smooth = 0.05 * (z.real**2 + 1j * z.real * z.imag)
+    white = rng.normal(size=len(z)) + 1j * rng.normal(size=len(z))
+    assert same_plate._not_shared(z, smooth) < 0.1
+    assert same_plate._not_shared(z, smooth + white) == pytest.approx(1.0, abs=0.25)
+    assert same_plate._not_shared(z[::30], white[::30]) == 0.0
 
 
 @pytest.mark.parametrize("size", [5e-7, 1e-5])
