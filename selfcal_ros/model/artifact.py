@@ -103,7 +103,8 @@ class Artifact:
         for name, size in () if self.marks else sides:
             if not 3 <= size <= MAX_GRID_SIZE or size % 2 == 0:
                 raise InputError(f"artifact {name}", f"{size} is not an odd number from 3 to "
-                                 f"{MAX_GRID_SIZE}", "the plate needs a mark at its centre")
+                                 f"{MAX_GRID_SIZE}", "give an odd number of rows, or a lattice "
+                                 "of even sides as a list (artifact: {marks: FILE.csv})")
         if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
                              "give the distance between marks in metres")

@@ -121,10 +121,10 @@ def identified(plate, where, marks, has_id, rules=RULES):
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
-@pytest.mark.parametrize("name", ["rings", "scatter", "holes", "lattice"])
+@pytest.mark.parametrize("name", ["rings", "scatter", "holes", "lattice", "even"])
 def test_marks_are_identified(name, with_ids):
     plate = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, (0, 8, 24, 33)),
-             "lattice": lambda: lattice(7)}[name]()
+             "lattice": lambda: lattice(7), "even": lambda: lattice(8)}[name]()
     where, marks = read(plate, np.random.default_rng(1))
     found = identified(plate, where, marks, with_ids)
     assert not found.reasons.any()

@@ -27,7 +27,8 @@ BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
 COUNT = 25
 HOLES = (0, 3, 17, 24, 25, 31, 40, 48)
-PLATES = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, HOLES)}
+PLATES = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, HOLES),
+          "even": lambda: lattice(8)}
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
@@ -158,6 +159,17 @@ def test_a_plan_is_judged_as_the_dense_solution():
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     _, u = dense(readings(artifact, SIX, np.random.default_rng(0))[0])
     assert np.stack([found.ux, found.uy]) == pytest.approx(u, rel=1e-5)
+
+
+@pytest.mark.parametrize(("nodes", "gain"), [(5, 0.6798), (7, 0.8200)])
+def test_three_views_determine_a_lattice_of_even_sides(nodes, gain):
+    """As docs/identifiability.md says: 0, 90 deg and a shift by a pitch."""
+    artifact = lattice(8, nodes=nodes)
+    views = (View("0", 0.0), View("90", np.pi / 2),
+             View("shift", 0.0, (artifact.grid_pitch_m, 0.0)))
+    plan = Plan("even", artifact, views)
+    assert check_plan(plan).observability.identifiable
+    assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(gain, abs=1e-4)
 
 
 def test_a_plan_that_shows_too_little_is_refused():

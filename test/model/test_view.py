@@ -72,7 +72,8 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((10, 0.01), "artifact grid_size: 10 is not an odd number from 3 to 1001"),
+    ((10, 0.01), "artifact grid_size: 10 is not an odd number from 3 to 1001; give an odd number "
+     "of rows, or a lattice of even sides as a list (artifact: {marks: FILE.csv})"),
     ((1, 0.01), "artifact grid_size: 1 is not"), ((-3, 0.01), "artifact grid_size: -3 is not"),
     ((4003, 0.01), "artifact grid_size: 4003 is not"),
     ((11, 0.01, 0, 4), "artifact grid_size_y: 4 is not"),

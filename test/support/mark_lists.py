@@ -43,7 +43,7 @@ def scatter(number: int = 80, nodes: int = 5, seed: int = 3, *, half_m: float = 
 
 def lattice(size: int, holes=(), nodes: int = 5, **kwargs) -> Artifact:
     """Return the lattice of size x size marks as a list, without the marks of some numbers."""
-    along = np.arange(size) - size // 2
+    along = np.arange(size) - (size - 1) / 2
     x, y = (part.ravel() * 2 * HALF_M / (size - 1) for part in np.meshgrid(
         along, along, indexing="ij"))
     kept = np.setdiff1d(np.arange(size * size), holes)
