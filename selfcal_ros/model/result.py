@@ -42,7 +42,7 @@ SCHEMA = "selfcal.result/1"
 COMBINED = "combined"
 """Method of a mean of several results, and key of the runs behind it."""
 PRIOR = "prior"
-"""Key of the prior of a map: kind, size, length, and the map of the readings alone."""
+"""Key of the prior of a map: kind, size, length, nodes left out, and map of the readings alone."""
 LARGEST = 1e3
 """Larger errors and uncertainties, in m or rad, are invalid: sums of their squares overflow."""
 

@@ -213,7 +213,9 @@ SENTENCES: dict[str, Words] = {
         "the map has a prior: its error beyond first order is taken for a smooth random field of "
         f"{f.size * UM_PER_M:.3g} µm and a correlation length of {of['length_m'] * MM_PER_M:.3g} "
         f"mm, as the readings show; by these alone u would be {of['u_rms_without'] * UM_PER_M:.3g} "
-        f"instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)"),
+        f"instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)" + (
+            f"; {_counted([tuple(at) for at in of['left_out']], 'node')} may stand off that field: "
+            "no prior there" if of["left_out"] else "")),
     "few_read": phrases.few_read_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (

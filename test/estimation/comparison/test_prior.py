@@ -34,12 +34,19 @@ SIGMA_M, PITCH_M = 20e-9, 0.01
 GP = replace(BARE, prior="gp")
 
 
-def measured(seed, length, *, size=11, g_m=2e-7, sense=Sense.MICROSCOPE_MOVES, **how):
-    """Return a truth with a stage of the correlation length `length`, pitches, and readings."""
+def measured(seed, length, *, size=11, g_m=2e-7, sense=Sense.MICROSCOPE_MOVES, off=None, **how):
+    """Return a truth with a stage of the correlation length `length`, pitches, and readings.
+
+    With `off`: (by m, nodes) that stand off the smooth stage.
+    """
     artifact = Artifact(size, PITCH_M, 0, **how)
     views = (View("first"), View("quarter", math.pi / 2), View("shift", 0.0, (PITCH_M, 0.0)))
     rng = np.random.default_rng(seed)
     truth = random_truth(artifact, 3, rng, Spread(correlation_pitches=length, g_m=g_m))
+    if off is not None:
+        by_m, nodes = off
+        truth = replace(truth, g=truth.g.copy())
+        truth.g[(slice(None), *np.transpose(nodes))] += by_m * np.array([[0.6], [-0.8]])
     return truth, simulate_measurements(truth, Plan("p", artifact, views), rng, sigma_m=SIGMA_M,
                                         sense=sense)
 
@@ -84,18 +91,52 @@ def test_a_stage_smooth_and_rough_at_once_contradicts_it():
         with_prior(rough, xy_covariance)
 
 
+@pytest.mark.parametrize(("length", "by_m"), [(8.0, 8e-8), (4.0, 8e-8), (4.0, 1e-6)])
+def test_a_scratched_node_is_left_to_its_readings(length, by_m):
+    """80 nm are 4 sigma of a reading; smoothed away, they were 5 to 18 u."""
+    found = []
+    for seed in range(12):
+        node = (3 + seed % 5, 2 + seed % 7)
+        _, readings = measured(seed, length, off=(by_m, [node]))
+        plain, result = calibrate(readings, BARE), calibrate(readings, GP)
+        out = result.extra[PRIOR]["left_out"]
+        found.append([node[0] - 5, node[1] - 5] in out)
+        assert len(out) <= 3
+        if not found[-1]:
+            continue
+        before, after = (np.array([one.error_map.u_gx, one.error_map.u_gy])
+                         for one in (plain, result))
+        assert (after[:, *node] > 0.7 * before[:, *node]).all()
+        assert np.median(after / before) < 0.7
+        moved = np.stack([getattr(result.error_map, name) - getattr(plain.error_map, name)
+                          for name in ("gx", "gy")])
+        assert (np.abs(moved[:, *node]) < 3 * before[:, *node]).all()
+        assert f"({out[0][0]}, {out[0][1]})" in " ".join(worded(result).warnings)
+    assert sum(found) >= 11
+
+
+def test_many_scratched_nodes_are_a_rough_stage():
+    nodes = [(m, n) for m in range(1, 10, 2) for n in range(1, 10, 2)]
+    with pytest.raises(InputError, match=r"prior: the stage's error is correlated over 0\.\d+ "):
+        calibrate(measured(4, 8.0, g_m=1e-6, off=(1.5e-7, nodes))[1], GP)
+
+
 def test_a_stage_without_an_error_beyond_first_order_teaches_nothing():
     with pytest.raises(InputError, match="prior: the readings show no error of the stage beyond"):
         calibrate(measured(1, 4.0, g_m=1e-12)[1], GP)
 
 
-def dense(result, size_m, length_m):
+def dense(result, facts):
     """Return mean and covariance of a Gaussian process regression with very wide first orders."""
+    size_m, length_m = facts["size_m"], facts["length_m"]
     emap = result.error_map
     place = (emap.artifact.x_m + 1j * emap.artifact.y_m).ravel()
     noise, _ = xy_covariance(result, emap.valid)
     first = np.stack([np.ones(len(place)), place.real / 0.05, place.imag / 0.05], axis=1)
     one = size_m**2 * np.exp(-np.abs(place[:, None] - place) ** 2 / (2 * length_m**2))
+    for m, n in facts["left_out"]:  # any value of its own
+        at = np.flatnonzero((emap.artifact.m.ravel() == m) & (emap.artifact.n.ravel() == n))
+        one[at, at] += (1e3 * size_m) ** 2
     prior = np.kron(np.eye(2), one + (1e3 * size_m) ** 2 * first @ first.T)
     values = np.concatenate([emap.gx.ravel(), emap.gy.ravel()])
     # readings do not tell the datum: it is told to be that of the map
@@ -108,12 +149,14 @@ def dense(result, size_m, length_m):
     return gain @ values, left @ spread @ left.T + gain @ noise @ gain.T
 
 
-@pytest.mark.parametrize("sense", Sense)
-def test_the_map_is_that_of_a_dense_regression(sense):
-    _, readings = measured(5, 4.0, size=7, sense=sense)
+@pytest.mark.parametrize(("sense", "off"), [
+    *((sense, None) for sense in Sense), (Sense.MICROSCOPE_MOVES, (3e-7, [(4, 2)]))])
+def test_the_map_is_that_of_a_dense_regression(sense, off):
+    _, readings = measured(5, 4.0, size=7, sense=sense, off=off)
     plain, result = calibrate(readings, BARE), calibrate(readings, GP)
     facts, emap = result.extra[PRIOR], result.error_map
-    values, cover = dense(plain, facts["size_m"], facts["length_m"])
+    assert facts["left_out"] == ([] if off is None else [[1, -1]])
+    values, cover = dense(plain, facts)
     scale = np.abs(values).max()
     np.testing.assert_allclose(np.concatenate([emap.gx.ravel(), emap.gy.ravel()]), values,
                                rtol=0, atol=1e-4 * scale)
@@ -135,7 +178,8 @@ def test_the_map_is_that_of_a_dense_regression(sense):
 
 def test_size_and_length_are_those_of_the_greatest_restricted_likelihood():
     field = field_of(calibrate(measured(7, 4.0)[1], BARE), xy_covariance)
-    size, length = estimated(field)
+    field, size, length = estimated(field)
+    assert field.held.all()
     noise = min(np.linspace(0.8, 1.25, 46), key=lambda of: field.misfit(size, length, of)[0])
     best = field.misfit(size, length, noise)[0]
     for other in (1.03, 0.97):
