@@ -83,7 +83,7 @@ def bag_files(path: Path) -> list[Path]:
     """Return the MCAP files of a bag; none if it is something else. Opens regular files only."""
     try:
         if path.is_dir():
-            return sorted(path.glob("*.mcap"))
+            return sorted(file for file in path.glob("*.mcap") if file.is_file())
         if path.is_file():
             with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
                 return [path] * (file.read(len(MAGIC)) == MAGIC)  # None: it would have to wait

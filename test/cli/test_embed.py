@@ -15,7 +15,7 @@ from selfcal_ros.bagio import attachments
 from selfcal_ros.bagio.attachments import attach, attached
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
-from selfcal_ros.results import bag_files
+from selfcal_ros.results import bag_files, result_bytes
 from test.support.pages import ROOT
 
 
@@ -235,6 +235,15 @@ def test_a_name_that_cannot_be_printed_is_one_line(bag, tmp_path, capsys, name):
     err = capsys.readouterr().err
     assert "has characters that cannot be printed; rename the file" in err and err.count("\n") == 1
     assert file_in(bag).read_bytes() == before
+
+
+def test_folders_and_pipes_named_like_a_file_of_a_bag_are_none(bag, tmp_path):
+    [file] = bag_files(bag)
+    (bag / "folder.mcap").mkdir()
+    os.mkfifo(bag / "pipe.mcap")
+    assert bag_files(bag) == [file]
+    with pytest.raises(InputError):
+        result_bytes(tmp_path)
 
 
 @pytest.mark.skipif(not os.access("/proc/kmsg", os.R_OK), reason="needs the log of the kernel")
