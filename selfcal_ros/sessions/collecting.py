@@ -22,6 +22,7 @@ from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements, placing_digest, session_digest, view_digest
 from selfcal_ros.sessions.clocks import ClockWatch, RunWatch
 from selfcal_ros.sessions.health import CellChecks, Diagnosis, Level, Ports, Rate, merged
+from selfcal_ros.sessions.rejections import RejectionWatch
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 
@@ -52,9 +53,7 @@ class CollectingSession:
         self._costs: deque[tuple[float, float]] = deque(maxlen=1000)  # time, and CPU time
         self._published: dict[int, str] = {}
         self._run = ("", "")
-        self._advised: set[int] = set()
-        self._warned: set[tuple[int | None, str]] = set()
-        self._findings: list[str] = []
+        self._rejections = RejectionWatch(ports.say, ports.now_s)
         self._stepped: list[str] = []
         self._checks = CellChecks(ports.say)
         self._noted: list[str] = []  # notes on clocks in the readings sent last
@@ -165,9 +164,12 @@ class CollectingSession:
 
     def tick(self) -> None:
         """Publish the progress of the views, if there are new messages and it is due."""
+        if not self._dirty:
+            self._rejections.tell()
+            return
         now, worked = self._ports.now_s(), self._ports.cpu_s()
         early = now < self._next_status
-        if not self._dirty or (early and not (now >= self._rested and self._may_complete())):
+        if early and not (now >= self._rested and self._may_complete()):
             return
         self._dirty, self._unseen = False, []
         try:
@@ -213,20 +215,23 @@ class CollectingSession:
         timeline, frame_id = self.collector.timeline, self.settings.frame_id
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
-            self._advised, self._warned, self._noted = set(), set(), []
+            self._noted = []
+            self._rejections.restart()
         self._tell_runs()
         self._tell_steps()
         self._checks.take(measurements)
-        self._warn(measurements, progress)
+        ended = [index for index, view in progress.items()
+                 if final or view.end_ns <= timeline.last_stamp_ns]
+        self._rejections.take(self.collector.findings(measurements, progress), progress, ended,
+                              final=final)
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
             key = view_digest(view.readings.parts, measurements.rejected)
-            closed = view.end_ns <= timeline.last_stamp_ns
-            ready = final or closed or view.complete
+            ready = index in ended or view.complete
             # empty, unless a previous collector may have sent its readings
             worth = view.readings.used or view.readings.rejected or index in self._published or (
-                (final or closed) and (timeline.plan_id, index) not in self.missed)
+                index in ended and (timeline.plan_id, index) not in self.missed)
             is_new = self._published.get(index) != key or self._noted != self._stepped
             if ready and worth and is_new:
                 self._published[index], self._noted = key, self._stepped
@@ -240,27 +245,6 @@ class CollectingSession:
                                                  run_id=timeline.run_id)
                 fields["complete"] &= not self._clock.ahead  # may be of another view
                 self._ports.publish("status", fields)
-            if closed or final:
-                self._advise(index, view)
-
-    def _warn(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
-        """Report once per view and reason that most of its detections were rejected."""
-        self._findings = []
-        for index, finding in self.collector.findings(measurements, progress).items():
-            where = f"view '{progress[index].view.name}': " if index is not None else ""
-            self._findings.append(f"{where}{finding}")
-            if (index, finding.reason) not in self._warned:
-                self._warned.add((index, finding.reason))
-                self._ports.say(Level.WARN, self._findings[-1])
-
-    def _advise(self, index: int, view: ViewProgress) -> None:
-        """Report once per finished view the remedies for its rejections."""
-        rejected = {reason: count for reason, count in view.readings.rejected.items()
-                    if not {(index, reason), (None, reason)} & self._warned}
-        lines = advice(rejected) if index not in self._advised else []
-        for line in lines:
-            self._ports.say(Level.WARN, f"view '{view.view.name}': {line}")
-            self._advised.add(index)
 
     def _tell_steps(self) -> None:
         """Log once that a clock has stepped or is ahead; in the health until the run ends."""
@@ -320,7 +304,7 @@ class CollectingSession:
             **received, "views": len(self._published), **self._newest(), **self._cost(),
             "detections_matched": "yes" if detections_matched else "no",
             **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
-        lines = self._findings or advice(self._rejected)
+        lines = self._rejections.findings or advice(self._rejected)
         found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
         runs = Diagnosis(Level.WARN if self._run_lines else Level.OK,
                          "; ".join(self._run_lines.values()))

@@ -211,7 +211,8 @@ def test_positions_that_nothing_explains():
     assert "m from the sites of the marks that are seen (median); check joint_x" in found
 
 
-@pytest.mark.parametrize(("ahead_s", "side"), [(37.0, "after"), (-3600.0, "before")])
+@pytest.mark.parametrize(("ahead_s", "side"), [(5.0, "after"), (37.0, "after"),
+                                               (-3600.0, "before")])
 def test_a_clock_of_its_own(ahead_s, side):
     cell = scene(count=0)
     shift = round(ahead_s * S)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """measurement_collector: the QoS it takes the encoder with, status, finish, readings sent on."""
 
+import time
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from selfcal_ros.model.readings import readings_digest, session_digest
 from selfcal_ros.nodes import base, measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
+from selfcal_ros.sessions import rejections
 from selfcal_ros.units import NS_PER_S
 from test.support.collecting import scene
 from test.support.plans import image_plan, plan_of
@@ -319,6 +321,35 @@ def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, mon
         assert graph.call(Trigger, FINISH).success
     [line] = [text for text in said if text.startswith("view 'line': ")]
     assert "rotation_not_known" in line
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 5.0])
+def test_an_encoder_that_is_heard_late_is_no_fault_and_one_with_a_clock_of_its_own_is(
+        graph, monkeypatch, offset_s):
+    patience_s = 2.0
+    monkeypatch.setattr(rejections, "PATIENCE_S", patience_s)
+    events = scene("0", count=0)
+    first, late = [*events.commands[:-1], *events.detections], [
+        replace(sample, stamp_ns=sample.stamp_ns - round(offset_s * NS_PER_S))
+        for sample in events.samples]
+    node = graph.node(MeasurementCollector, status_period=0.02)
+    said: list[tuple[float, str]] = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(
+        warning=lambda line: said.append((time.monotonic(), line))))
+    status = graph.listen(names.STATUS)
+    publish_events(graph, first)
+    graph.until(lambda: status and status[-1].detections_rejected == 25, "all of them rejected")
+    rejected_s = time.monotonic()
+    publish_events(graph, late)
+    if not offset_s:
+        graph.until(lambda: status[-1].detections_used == 25, "the readings")
+        graph.until(lambda: time.monotonic() > rejected_s + 1.5 * patience_s, "the time")
+        assert said == []
+        return
+    graph.until(lambda: said, "the warning")
+    [(told_s, line)] = said
+    assert told_s - rejected_s > 0.5 * patience_s
+    assert "the detections are stamped about 5 s after the encoder samples" in line
 
 
 @pytest.mark.usefixtures("quick_beat")

@@ -11,6 +11,7 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level, Ports
+from selfcal_ros.sessions.rejections import PATIENCE_S
 from test.support.collecting import gathered, scene
 from test.support.ports import message
 
@@ -39,6 +40,10 @@ class Cell:
         self.session.tick()
         return self
 
+    def wait(self):
+        self.now += PATIENCE_S
+        self.session.tick()
+
     def of(self, output):
         return [fields for name, fields in self.published if name == output]
 
@@ -47,6 +52,8 @@ def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
     cell, events = Cell(), scene(count=0, sense=Sense.PLATE_MOVES)
     half = events.detections[12].stamp_ns
     cell.feed(e for e in events.events if e.stamp_ns < half)
+    assert cell.said == []  # encoder samples and commands may be late
+    cell.wait()
     assert [level for level, _ in cell.said] == [Level.WARN]
     said = cell.said[0][1]  # one view does not tell both
     assert said.startswith("12 of 12 detections were rejected as stage_not_at_mark: the plate lies "
@@ -61,7 +68,7 @@ def test_a_view_of_which_all_was_rejected_is_published_as_it_is_offline():
     cell, events = Cell(), scene("0, 90", count=0)
     for index in range(25):
         events.spoil(index, m=77)
-    cell.feed(events.events)
+    cell.feed(events.events).wait()
     rejected, good = cell.of("measurement")
     assert (rejected["view_index"], rejected["m"].size) == (0, 0)
     assert (rejected["reject_reasons"], rejected["reject_counts"]) == (["unknown_mark"], [25])

@@ -17,6 +17,7 @@ from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import take_up
+from selfcal_ros.sessions.rejections import PATIENCE_S
 from selfcal_ros.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import CellSettings, plan_events
@@ -152,7 +153,8 @@ def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, 
         events[n] = replace(events[n], sigma=1e4)
     for part in (events, events[-3:]):
         desk.feed(part)
-        desk.hands.pass_time(1)
+        desk.session.tick()
+        desk.hands.pass_time(PATIENCE_S)
         desk.session.tick()
     said = [line for line in desk.hands.lines(Level.WARN) if "sigma_out_of_range" in line]
     assert [text[:len(line)] for text, line in zip(said, lines, strict=True)] == lines
@@ -328,6 +330,9 @@ def test_repeatability_against_its_limit(limit, level):
 def test_a_wrong_sense_is_told_in_the_log_and_in_the_health():
     desk = Desk(measurement_sense="plate_moves", status_period=0.02)
     desk.feed(first_view())
+    desk.session.tick()
+    assert (desk.told().level, desk.hands.lines(Level.WARN)) == (Level.OK, [])
+    desk.hands.pass_time(PATIENCE_S)
     desk.session.tick()
     [line] = desk.hands.lines(Level.WARN)
     assert "measurement_sense" in line

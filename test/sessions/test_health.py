@@ -73,6 +73,15 @@ def test_what_two_sources_tell_of_one_loss_counts_once(hands, told):
         f"topic: {told[0][0]}", "other: 1"]
 
 
+def test_a_loss_that_the_other_source_reports_later_is_no_new_one(hands):
+    losses = Losses(hands.ports.say, hands.ports.now_s)
+    losses.add("topic", 5)
+    hands.pass_time(1000.0)
+    losses.add("topic", 5, told_by="numbers")
+    assert len(hands.lines(Level.WARN)) == 1
+    assert losses.diagnosis().level == Level.OK
+
+
 def test_what_was_published_while_nobody_listened_is_told_apart(hands):
     losses = Losses(hands.ports.say, hands.ports.now_s)
     losses.add("topic", 2)
