@@ -172,6 +172,25 @@ def test_three_views_determine_a_lattice_of_even_sides(nodes, gain):
     assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(gain, abs=1e-4)
 
 
+@pytest.mark.parametrize("how", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("poses", [THREE, SIX])
+def test_three_nodes_a_side_are_determined_as_the_dense_solution_says(how, poses):
+    """Only one of them lies in the core of the plate: the datum is that of all."""
+    artifact = lattice(4, nodes=3, interpolation=how)
+    plan = Plan("p", artifact, views_of(artifact, poses))
+    assert check_plan(plan).observability.identifiable
+    found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
+    _, u = dense(readings(artifact, poses, np.random.default_rng(0))[0])
+    assert np.stack([found.ux, found.uy]) == pytest.approx(u, rel=1e-5)
+
+
+@pytest.mark.parametrize("poses", [THREE[:1], ((0, (0, 0)), (90, (0, 0))),
+                                   ((0, (0, 0)), (180, (0, 0)), (0, (1, 0)))])
+def test_three_nodes_a_side_are_not_determined_by_turns_or_shifts_alone(poses):
+    artifact = lattice(4, nodes=3)
+    assert not check_plan(Plan("p", artifact, views_of(artifact, poses))).observability.identifiable
+
+
 def test_a_plan_that_shows_too_little_is_refused():
     artifact = scatter()
     found, _ = readings(artifact, THREE[:1], np.random.default_rng(0))

@@ -105,10 +105,13 @@ def test_nodes_that_no_reading_tells_are_unknown():
     assert np.nanmax(np.abs(error_in_datum(emap, truth))) < 1e-11
 
 
-@pytest.mark.parametrize(("turn", "nodes", "count"), [(5, 9, 45), (5, 7, 27), (37, 9, 81)])
-def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(turn, nodes, count):
+@pytest.mark.parametrize(("turn", "shift", "nodes", "count"), [
+    (5, (1, 0), 9, 45), (5, (1, 0), 7, 27), (37, (1, 0), 9, 81), (37, (1.3, -0.7), 7, 43),
+    (37, (1.3, -0.7), 9, 69)])
+def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(turn, shift, nodes,
+                                                                             count):
     """As a dense least squares has it, at nodes of the datum and at others; half of them do."""
-    found, _ = readings(plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, (1, 0))),
+    found, _ = readings(plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, shift)),
                         np.random.default_rng(10))
     half = (nodes - 1) / 2
     known = np.abs(np.indices((nodes, nodes)) - half).max(axis=0) < 0.7499 * half

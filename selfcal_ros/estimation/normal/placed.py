@@ -172,6 +172,8 @@ class PlacedEquations(NormalEquations):
         ratio = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
         inverse = self.inverse(ratio) if ratio else self.grid_inverse
         known = some & (np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE)
+        if known.sum() < 3:  # three nodes a side
+            known = some
         for _ in range(2):
             if known.sum() < 3:
                 return np.zeros(views.shape, dtype=bool)
