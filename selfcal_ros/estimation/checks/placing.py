@@ -36,6 +36,8 @@ BETTER = 30.0
 """Gain of the log-likelihood above which another pose is accepted."""
 CLEARLY = 10.0
 """Required gain over the second best pose."""
+LEFT = 0.05
+"""Part of that mean square which another pose may leave: other faults may be there as well."""
 SAME_MARK = 0.1
 """Distance, in pitches, within which a mark at another pose lies on a mark of a list."""
 ON_MARKS = 0.8
@@ -119,7 +121,7 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     tried.sort(key=lambda item: -item[0])
     gain, left, view, before, pose = tried[0]
     second = tried[1][0] if len(tried) > 1 else 0.0
-    if gain < BETTER or gain - second < CLEARLY or left > CONTRADICTED:
+    if gain < BETTER or gain - second < CLEARLY or left > max(CONTRADICTED, LEFT * square):
         return None
     return Misplaced.of(view.name, before, pose, gain)
 
@@ -197,7 +199,7 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
             isinstance(pose, LatticePose) and pose.quarter_turns is None):
         return None
     i, j = pose.site_of(*artifact.places(view.m, view.n))
-    inside = (np.abs(i) <= WINDOW) & (np.abs(j) <= WINDOW)
+    inside = np.maximum(np.abs(i), np.abs(j)) <= WINDOW + EDGE
     if inside.sum() < LEAST_READINGS:
         return None
     return _Seen(pose, (i + 1j * j)[inside], (view.dx + 1j * view.dy)[inside], view.count[inside])
