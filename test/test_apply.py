@@ -130,6 +130,14 @@ def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result)
     assert a > 0 <= b and a + b * length.max() < 2 * U.max()
 
 
+def test_the_line_is_that_of_the_diagonals_if_x_and_y_err_alike(file, result, monkeypatch):
+    """Of sites with one error of sigma along both axes, diagonal distances have u = 2 sigma."""
+    monkeypatch.setattr(StageMap, "covariance", lambda self, x, y: 1e-16 * np.kron(
+        np.ones((2, 2)), np.eye(len(x))))
+    a, b = load(file).length_uncertainty(anywhere=False)
+    assert a == pytest.approx(2e-8 * result.noise.k_xy, rel=1e-6) and abs(b) < 1e-12
+
+
 def test_between_nodes_the_line_covers_the_interpolation_too(file, result):
     stage, plate, rng = load(file), result.artifact, np.random.default_rng(4)
     ends = rng.uniform(-2, 2, (4, 400)) * plate.grid_pitch_m

@@ -28,12 +28,15 @@ def words(drawing):
 def test_a_table_with_holes_or_absurd_errors_is_not_tried():
     result, _ = known_result(5, 0)
 
-    def why_not(gx):
-        section, = table_chapter(replace(result, error_map=replace(result.error_map, gx=gx))
+    def why_not(gx, **gy):
+        section, = table_chapter(replace(result, error_map=replace(result.error_map, gx=gx, **gy))
                                  ).sections
         return section.notes[0]
 
-    assert why_not(np.full((5, 5), 6e-3)) == "a table cannot correct errors beyond half a pitch"
+    far, none = np.zeros((5, 5)), np.zeros((5, 5))
+    far[1, 2] = -6e-3
+    for gx, gy in ((far, none), (none, far)):
+        assert why_not(gx, gy=gy) == "a table cannot correct errors beyond half a pitch"
     gx = result.error_map.gx.copy()
     gx[0, 0] = np.nan
     assert why_not(gx).startswith("1 unknown site, but")

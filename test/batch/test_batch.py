@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,12 @@ from selfcal_ros.batch.table import (
 )
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.artifact import Artifact
 from test.support.bags import Foreign
+from test.support.options import bare
 from test.support.sessions import events_of, small_plan
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 from test.support.waiting import wait_until
 
 
@@ -356,3 +361,15 @@ def test_quantities_with_an_uncertainty_have_bars_and_no_course_of_it():
     text = page_html(found, series, [""])
     assert "bars ± 2 u" in text and "bars" not in plain
     assert text.count('class="s-soft" d=') == plain.count('class="s-soft" d=') + 30
+
+
+def test_the_share_of_rejected_detections_is_of_all_that_were_read():
+    plan, rng = hu_plan(Artifact(5, 0.01, 0)), np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=2e-8)
+    result = calibrate(readings, bare(causes=False))
+    used = sum(view.used for view in result.views)
+    assert used == 25 + 25 + 20
+    for rejected in ({}, {"late": 3, "outlier": 7}, {"late": 70}):
+        number = sum(rejected.values())
+        found = jobs.quantities(replace(result, rejected=rejected))["rejected_percent"]
+        assert found == pytest.approx(100 * number / (used + number))

@@ -18,7 +18,14 @@ from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model
-from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS, IMAGE_TYPES
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    IMAGE_TOPICS,
+    IMAGE_TYPES,
+    INPUT_TOPICS,
+)
 
 SIM = """
 plan:
@@ -226,6 +233,15 @@ def test_a_folder_of_files_gives_the_detections_of_the_bag(bag, tmp_path):
     values = [[own_values(data) for _, data in contents(
         tmp_path / name, f"/{DETECTION_TOPIC}")] for name in ("found", "of_bag")]
     assert values[0] == values[1]
+    for topic, kind in INPUT_TOPICS.items():
+        for time, data in contents(tmp_path / "found", f"/{topic}"):
+            stamp = store_with(kind).deserialize_cdr(data, kind).header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == time
+    with (tmp_path / "found" / "metadata.yaml").open() as file:
+        topics = yaml.safe_load(file)["rosbag2_bagfile_information"]["topics_with_message_count"]
+    latched = [one["topic_metadata"]["name"] for one in topics if "transient_local" in str(
+        one["topic_metadata"]["offered_qos_profiles"])]
+    assert latched == [f"/{COMMAND_TOPIC}"]
     assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
     result, truth = read_json(tmp_path / "R.json"), read_json(folder / "truth.json")
     for axis in ("gx", "gy"):

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each controller does with a file, in numbers worked out by hand from its documents."""
 
+import re
+
 import numpy as np
 import pytest
 
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.controllers.export import FORMATS
-from selfcal_ros.controllers.grid import Source, Wiring
+from selfcal_ros.controllers.grid import Source, Wiring, numbers
+from selfcal_ros.errors import InputError
 
 MM = MachineFrame(1, 2)
 
@@ -78,6 +81,21 @@ def test_beckhoff(x, y, tenths, sense):
     found = corrections("beckhoff", [lists(2), lists(1)], x, y, Wiring(MM, negate=sense < 0))
     assert found == pytest.approx([sense * (100 + tenths) * 1e-4, sense * (200 + tenths) * 1e-4],
                                   abs=1e-12)
+
+
+@pytest.mark.parametrize("key, value", [
+    ("interval", "0"), ("unit", "0"), ("last_index_master1", "-1"), ("master2_ax_nr", "3")])
+def test_a_beckhoff_list_of_another_grid_is_refused(key, value):
+    other = re.sub(rf"(crosscomp2\.{key}) \d+", rf"\1 {value}", lists(1))
+    with pytest.raises(InputError, match=r"unit 1, masters \[1, 2\] and a positive interval"):
+        corrections("beckhoff", [other, lists(2)], 0, 0)
+
+
+def test_numbers_are_those_that_a_double_holds_to_the_integer():
+    assert numbers("999999999999999 -9e14", "file:1", r"N\s+N") == [999999999999999, -9e14]
+    for text in ("1e15", "-1e15"):
+        with pytest.raises(InputError, match="file:1: a number is too large"):
+            numbers(text, "file:1", "N")
 
 
 @pytest.mark.parametrize("x, y, cx, cy", [

@@ -88,6 +88,16 @@ def test_a_recording_of_the_diagonals_only_has_no_linear_errors():
     assert cut.notes == ("1 move(s) that are not one step of one axis",)
 
 
+def test_linear_errors_of_some_axes_only_are_left_out_and_said():
+    series, until = recording(), 33 * 1_200_000_000  # rests of pp, np: 13 each, of x: 7
+    laser, position = series.laser_ns < until, series.position_ns < until
+    cut = cut_zigzag(Recording(series.laser_ns[laser], series.laser_m[laser],
+                               series.position_ns[position], series.position_m[position]), RULE)
+    said = "linear errors of some axes only: not used"
+    assert cut.runs == {"np": 1, "pp": 1, "x": 1} and cut.data.linear_m is None
+    assert said in cut.notes and said not in cut_zigzag(series, RULE).notes
+
+
 def test_a_missing_rest_is_named():
     # The 5th rest of pp never comes to rest: two moves are no steps, the run falls apart.
     def wander(positions):

@@ -133,6 +133,7 @@ def test_fields_of_a_command_by_name():
     ({"map_grid_size": 4, "map_grid_pitch": 0.1}, "map grid_size: 4 is not an odd number"),
     ({"angular_count": 7, "map_harmonics": 4}, "map harmonics: 4 harmonics cannot be told with 7"),
     ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the map an odd number"),
+    ({"image_nx": 2}, "image"), ({"image_nx": 3, "image_ny": 2}, "image"),
     ({"map_grid_size": 5, "map_grid_pitch": 0.1, "map_interpolation": "cubic"},
      "map_interpolation: 'cubic' is not known; use one of bilinear, bicubic"),
     ({"header": from_model.header(-1, "f")},

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
-from selfcal_ros.model.view import View
+from selfcal_ros.model.pose import LatticePose, turn_in_lines
+from selfcal_ros.model.view import MAX_SHIFT, View
 
 PLATE = Artifact(11, 10e-3)
 
@@ -114,3 +115,31 @@ def test_poses_that_no_map_allows(view, message):
     with pytest.raises(InputError) as caught:
         view.on_stage(plate)
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(("shift", "refused"), [
+    ((MAX_SHIFT, 0.0), False), ((0.0, -MAX_SHIFT), False), ((MAX_SHIFT + 1, 0.0), True),
+    ((0.0, -MAX_SHIFT - 1), True)])
+def test_a_shift_along_one_axis_is_enough_to_be_refused(shift, refused):
+    """100 000 pitches are the last that are taken."""
+    view = View("v", 0.0, (shift[0] * 0.5, shift[1] * 0.5))
+    plate = Artifact(11, 0.5)
+    if refused:
+        with pytest.raises(InputError, match="beyond every field"):
+            view.on_stage(plate)
+    else:
+        assert view.on_stage(plate).site_of(0, 0) == shift
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_quarter_turn_has_90_deg(quarters):
+    assert LatticePose(quarters, (0, 0), None).turn_deg == 90 * quarters
+
+
+def test_turns_of_a_fourier_map_are_whole_lines_to_rounding_alone():
+    """A part of a line that is no rounding counts; on lines it would not be read at all."""
+    plate = replace(Artifact(11, 0.01, 24), harmonics=5)
+    line = 2 * math.pi / 24
+    assert turn_in_lines(26 * line, plate) == 2
+    assert turn_in_lines((3 + 1e-7) * line, plate) == pytest.approx(3 + 1e-7, abs=1e-11)
+    assert turn_in_lines(-0.25 * line, plate) == pytest.approx(23.75)

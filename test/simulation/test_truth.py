@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
@@ -23,7 +24,8 @@ from test.support.truth import (
     simulate_measurements,
 )
 
-PLATES = [Artifact(11, 0.01, 24), Artifact(21, 0.005, 72), Artifact(5, 0.01, 8, 9)]
+PLATES = [Artifact(11, 0.01, 24), Artifact(21, 0.005, 72), Artifact(5, 0.01, 8, 9),
+          Artifact(5, 0.01, 12)]
 
 
 AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
@@ -132,6 +134,11 @@ def test_simulated_noise_is_that_of_a_mean_of_repeats():
 def test_plates_without_lines_have_three_views_of_hu():
     assert [v.name for v in hu_plan(Artifact(5, 0.01)).views] == ["identity", "rot90", "shift_x"]
     assert truth_of(Artifact(5, 0.01)).g_theta.shape == (0,)
+
+
+def test_axes_between_the_lines_are_refused():
+    with pytest.raises(InputError, match="of 6 lines none lies on the y axis; use independent"):
+        truth_of(Artifact(5, 0.01, 6))
 
 
 def test_half_axes_of_one_site_leave_the_lines_as_drawn():

@@ -189,7 +189,7 @@ def test_the_probability_is_that_of_student_or_a_little_more(dof):
     for r in (0.05, 0.3, 0.6, 0.95):
         exact = stdtr(dof - 1, -r * np.sqrt((dof - 1) / (1 - r**2)))
         assert exact <= _p_of(r, dof) <= (1.1 * exact + 1e-300 if exact < 0.01 else 0.5)
-    assert _p_of(-0.5, dof) == 0.5
+    assert _p_of(-0.5, dof) == _p_of(0.0, dof) == 0.5
 
 
 def measured_session(spoilt, *, sense, with_ids, text="0, 90, tx", **how):
@@ -282,3 +282,8 @@ def test_rejected_kinds_are_in_no_sums():
     readings = collect([e for e in cell.events
                         if not (isinstance(e, Detection) and e.kind == Kind.ANGULAR)])[0].views[0]
     assert readings.motion_theta is None and readings.motion.dof == 2 * (25 * 2 - 5) // 3
+
+
+@pytest.mark.parametrize("correlation", [0.0, -0.3])
+def test_a_correlation_of_no_sign_or_the_other_one_is_as_probable_as_not(correlation):
+    assert _p_of(correlation, 10) == 0.5

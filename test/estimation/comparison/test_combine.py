@@ -2,6 +2,7 @@
 """Maps combined: weights, what is shared, the part between runs, coverage, false alarms."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from scipy.stats import binom, chi2
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.between import Run, mean_of, variance_between
-from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.between import Run, _parts, mean_of, variance_between
+from selfcal_ros.estimation.comparison.combine import Part, _of_run, combine
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
@@ -378,3 +379,29 @@ def test_sets_of_runs_differ_by_their_seed_alone():
     same = [combined(Case(2, "square", 1e-7), seed)[0].xy.values for seed in (1, 1, 2)]
     np.testing.assert_array_equal(same[0], same[1])
     assert np.abs(same[0] - same[2]).max() > 1e-8
+
+
+def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
+    rng = np.random.default_rng(3)
+    basis = np.linalg.qr(rng.normal(size=(8, 8)))[0]
+    q, shapes, others = basis[:, :2], basis[:, 2:4], basis[:, 4:]
+    variances = np.array([3.0, 1.0, 2.0, 4.0, 6.0, 8.0]) * 1e-16  # nothing along the datum
+    free = basis[:, 2:]
+    values = rng.normal(size=(3, 6)) @ free.T
+    found = _parts(values, [free * variances @ free.T] * 3, q, shapes)
+    assert found.n_rest == 4
+    np.testing.assert_allclose(found.within, np.tile([3e-16, 1e-16], (3, 1)))
+    np.testing.assert_allclose(found.rest_within, 5e-16)
+    np.testing.assert_allclose(found.rest, values @ others @ others.T, atol=1e-12)
+    np.testing.assert_allclose(found.rest_share, (others**2).sum(axis=1))
+
+
+@pytest.mark.parametrize(("p", "p_z", "both"), [(0.01, 0.3, 0.02), (0.3, 0.01, 0.02),
+                                                (0.7, 0.6, 1.0)])
+def test_the_probability_of_a_run_is_twice_that_of_its_worse_test(p, p_z, both):
+    found = _of_run(SimpleNamespace(
+        e_n=np.array([0.5, -2.0, 0.5, -0.5]), p_scatter=0.04,
+        test=SimpleNamespace(p=p, p_z=p_z, significant=both < 0.05)), "_theta", 0.05)
+    assert found == {"e_n_rms_theta": pytest.approx(np.sqrt(4.75 / 4)), "e_n_largest_theta": 2.0,
+                     "beyond_theta": 0.25, "p_theta": both, "agrees_theta": both == 1.0,
+                     "stands_out_theta": True}

@@ -55,6 +55,7 @@ def test_covariance_of_a_saved_map(sense, reference):
     options = bare(reference=reference)
     result = calibrate(readings, options)
     known = result.error_map.valid
+    assert all(np.ndim(view.read_grid) == 0 for view in result.views if view.read_grid is not None)
     found, correlated = xy_covariance(result, known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert correlated

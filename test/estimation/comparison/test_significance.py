@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, norm
 from scipy.stats import f as f_distribution
+from scipy.stats import t as student_t
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.maps import DIFFERENCE_LEVEL, compare, significance
+from selfcal_ros.estimation.comparison.maps import (
+    DIFFERENCE_LEVEL,
+    _of_largest,
+    compare,
+    significance,
+)
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -133,3 +139,16 @@ def test_the_comparison_is_the_same_after_the_file():
     assert two.xy.chi2_ratio == pytest.approx(one.xy.chi2_ratio, rel=1e-9)
     assert (two.xy.dof, two.xy.noise_dof) == (one.xy.dof, one.xy.noise_dof)
     assert two.xy.p_z == pytest.approx(one.xy.p_z, rel=1e-6)
+
+
+@pytest.mark.parametrize("noise_dof", [np.inf, 12.0])
+def test_nodes_that_move_together_are_as_one(noise_dof):
+    """Of ten equal values the largest is Student's or normal itself, not one of ten."""
+    alone = student_t(noise_dof) if np.isfinite(noise_dof) else norm
+    limit = alone.isf(DIFFERENCE_LEVEL / 4)
+    p, found = _of_largest(limit, 10, np.ones((10, 1)), noise_dof)
+    assert p == pytest.approx(DIFFERENCE_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
+    assert found == pytest.approx(limit, rel=0.06)
+    apart, bound = _of_largest(limit, 10, None, noise_dof)
+    assert apart == pytest.approx(10 * DIFFERENCE_LEVEL / 2)
+    assert bound == pytest.approx(alone.isf(DIFFERENCE_LEVEL / 40))

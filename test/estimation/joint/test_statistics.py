@@ -13,7 +13,7 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.reporting.words.findings import worded
 from test.support.lattice_plans import in_datum, plan_of
 from test.support.map_covariance import map_covariance
@@ -333,3 +333,23 @@ def test_finite_rotations_need_and_take_the_rigid_model(degrees):
     assert np.abs(rigid.error_map.gy - truth.g[1]).max() < 1e-12
     assert [view.phi for view in rigid.views] == pytest.approx(list(phi), abs=1e-12)
     assert np.abs(linear.error_map.gx - truth.g[0]).max() > 1e-9
+
+
+@pytest.mark.parametrize("kind", [ReferenceKind.STAGE_X, ReferenceKind.STAGE_Y])
+def test_a_length_of_the_stage_is_the_slope_of_the_known_sites(kind):
+    """Sites of an edge that no view reads: the known ones do not lie about the centre."""
+    artifact = Artifact(7, 0.01)
+    _, clean = measured(plan_of("0,90,tx,ty", artifact), seed=4, linear=True)
+    views = []
+    for view in clean.views:
+        at = view.view.lattice_pose(artifact).site_of(view.m, view.n)
+        views.append(subset(view, (at[0] < 2) & (at[1] > -3), np.zeros(0, dtype=bool)))
+    reference = ReferenceLength(kind, 5e-6, 1e-6)
+    emap = calibrate(replace(clean, views=tuple(views)), replace(
+        bare(misalignment_model="linear"), reference=reference)).error_map
+    assert not emap.valid.all() and emap.valid.sum() > 20
+    along, error = ((artifact.x_m, emap.gx) if kind is ReferenceKind.STAGE_X
+                    else (artifact.y_m, emap.gy))
+    assert abs(along[emap.valid].mean()) > 1e-3
+    slope = np.polyfit(along[emap.valid], error[emap.valid], 1)[0]
+    assert slope == pytest.approx(5e-6, abs=1e-12)

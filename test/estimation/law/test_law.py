@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
+from selfcal_ros.estimation.law.solve import _quadratic_form, hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -198,3 +198,14 @@ def test_order_of_views_does_not_matter():
     second = calibrate(replace(readings, views=readings.views[::-1]), LAW)
     assert np.array_equal(first.error_map.gx, second.error_map.gx)
     assert [v.phi for v in first.views] == [v.phi for v in second.views][::-1]
+
+
+def test_squares_in_a_few_directions_of_equal_noise_have_as_many_degrees_of_freedom():
+    """Chi-square: 3 directions of standard deviation 2 have the mean 12 and 3 degrees."""
+    rng = np.random.default_rng(6)
+    directions = 2 * np.linalg.qr(rng.normal(size=(20, 3)))[0]
+    assert _quadratic_form(directions, exact=True) == pytest.approx((12, 3))
+    drawn = directions @ rng.normal(size=(3, 40_000))
+    assert _quadratic_form(drawn, exact=False) == pytest.approx((12, 3), rel=0.04)
+    uneven = np.diag([1.0, 2.0])  # Satterthwaite: 5 squared over 1 + 16
+    assert _quadratic_form(uneven, exact=True) == pytest.approx((5, 25 / 17))

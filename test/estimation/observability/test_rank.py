@@ -13,7 +13,9 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.view import Plan, View
 from test.support.lattice_plans import plan_of
+from test.support.placed import SIX, plate
 from test.support.truth import random_truth, simulate_measurements
 
 PLANS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (0, 1, 0)),
@@ -94,3 +96,27 @@ def test_too_many_missing_marks_are_refused():
 def test_a_turn_by_one_line_is_advised_where_none_tells_the_lines_apart(lines, more):
     seen = plan_observability(plan_of("0,90", Artifact(5, 0.01, 8), lines=lines))
     assert seen.advice == ("add a view shifted by one pitch along X", *more)
+
+
+def test_a_view_of_a_single_mark_hides_its_own_rotation_alone():
+    """The other rotations, all lines and all sites are as well known as without it."""
+    poses = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+    views = tuple(LatticePose(pose[0], pose[1:], None) for pose in poses)
+    weight = LatticeViews((5, 5), views).in_field.astype(float)
+    weight[3] = 0
+    weight[3, 3, 1] = 1
+    lines = AngularSystem((0, 2, 1), np.ones((3, 8)))
+    system = NormalEquations(GridSystem(views, weight), lines, (0, 1, 2, 3), (0, 1, 4))
+    assert system.unseen.shape[1] == 1
+    assert system.known_lines.all() and system.known_sites.all()
+    rotations = system.known_views[0:12:3]
+    assert rotations.tolist() == [True, True, True, False]
+
+
+def test_unknowns_of_a_map_of_its_own_nodes():
+    """Both parts of 49 nodes and 121 marks, three misalignments a view; nothing is lacking."""
+    views = tuple(View(f"{number}", np.radians(turn), (x * 0.01, y * 0.01), True, False)
+                  for number, (turn, (x, y)) in enumerate(SIX))
+    seen = plan_observability(Plan("six", plate(11, 7), views))
+    assert seen.identifiable and seen.deficiency == 0
+    assert seen.rank == seen.unknowns == 2 * (49 + 121) + 3 * 6

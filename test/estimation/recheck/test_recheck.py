@@ -71,6 +71,18 @@ def sessions(sense=Sense.MICROSCOPE_MOVES, pose=(0, 0, 0), microscope=False):
                  for one, its in ((truth, plan), (changed, one_view(plan.artifact, *pose))))
 
 
+def require_first_order(emap):
+    """Require O and R of a map as a fit of its known nodes has them."""
+    known = emap.valid
+    x, y = (part[known] for part in (emap.artifact.x_m, emap.artifact.y_m))
+    one, none = np.ones_like(x), np.zeros_like(x)
+    along_x, along_y = np.stack([one, none, -y, x, y, x]), np.stack([none, one, x, y, x, -y])
+    values = np.concatenate([emap.gx[known], emap.gy[known]])
+    fitted = np.linalg.lstsq(np.hstack([along_x, along_y]).T, values, rcond=None)[0]
+    assert [emap.nonorthogonality, emap.scale_difference] == pytest.approx(fitted[4:], rel=1e-6)
+    assert np.abs(fitted[4:]).min() > 1e-9
+
+
 def require_same(result, wanted, *, rel=1e-5):
     """Require map, change and their covariances as one least squares has them."""
     emap, found = result.error_map, result.extra["recheck"]
@@ -91,6 +103,7 @@ def require_same(result, wanted, *, rel=1e-5):
             of, spread = wanted.of(rows)
             assert u == pytest.approx(spread, rel=rel)
             assert np.abs(value - of).max() < rel * spread.min()
+    require_first_order(emap)
     u = np.linalg.norm(wanted.scale)
     assert found["scale"]["change"] == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
     assert found["scale"]["u"] == pytest.approx(u, rel=rel)

@@ -8,6 +8,7 @@ import numpy as np
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
 from selfcal_ros.model.artifact import MapGrid
+from selfcal_ros.model.visit_order import visit_sequence
 from test.support.plans import plan_of
 
 
@@ -21,3 +22,15 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     for one, other in zip(*(ground.visits for ground in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-18)
+
+
+def test_a_check_stop_is_approached_as_its_place_beside_the_mark_tells():
+    plan = plan_of("0, 90, tx", 5)
+    views = [replace(view, check_marks=1, check_offset_m=2e-5) for view in plan.views]
+    ground = planned_ground(plan.artifact, views, planned_system(plan.artifact, views), Assumed())
+    for view, visits in zip(views, ground.visits, strict=True):
+        off = np.flatnonzero(visit_sequence(plan.artifact, view).aside_m.any(axis=0))
+        # from the mark in the last corner to +x of that in the middle, then to its -x, +y and -y
+        assert len(off) == 4 and (np.diff(off) == 1).all()
+        assert visits.approach_x[off[1:]].tolist() == [-1, 1, 1]
+        assert visits.approach_y[off[2:]].tolist() == [1, -1]

@@ -2,6 +2,7 @@
 """What is wrong with a machine is named, with its size; a clean one is qualified."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.verdict.explanations import find_explanations
+from selfcal_ros.estimation.verdict.explanations import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.model.terms import TermName, parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
@@ -106,6 +107,7 @@ def test_what_is_wrong_is_named_first_with_its_size(name):
     cause = verdict.causes[0]
     assert (cause.name, said in cause.text) == (term, True), cause.text
     assert cause.p < 5e-4
+    assert cause.effect_max > cause.effect_rms > 0
     if term == "slip":  # its place is one of twelve that are tried
         assert cause.size == pytest.approx(size, rel=0.25)
     else:
@@ -169,6 +171,9 @@ def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
     moved = np.stack([held.gx - without.gx, held.gy - without.gy])
     assert found.name == "microscope"
     assert found.effect_m == pytest.approx(np.sqrt((moved**2).mean()), rel=0.02)
+    cause = calibrate(readings, OPTIONS).verdict.causes[0]
+    assert cause.effect_rms == pytest.approx(found.effect_m, rel=0.02)
+    assert cause.effect_max == pytest.approx(np.hypot(*moved).max(), rel=0.02)
 
 
 @pytest.mark.parametrize(("consecutive", "repeats", "terms", "said"), [
@@ -182,3 +187,15 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
     assert result.findings == ((Finding("visited_once"),) if said else ())
+
+
+def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
+    found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
+    columns = SimpleNamespace(
+        columns=[SimpleNamespace(view=view, component=part) for view, part in found],
+        rows=lambda names: np.full(len(found), names == [TermName.DRIFT]))
+    tried = [[found[at] for at in np.flatnonzero(group.rows)]
+             for group in _groups(columns, [TermName.APPROACH, TermName.DRIFT])]
+    assert tried == [found, *(rows for view in range(3) for rows in (
+        [one for one in found if one[0] == view],
+        [one for one in found if one[0] == view and one[1] != "x P2"]))]

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
@@ -152,6 +152,9 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one():
     middle = 1e-3 * 0.01**2 / 4  # linear interpolation of a x^2 over a pitch, at its middle
     assert part.effect_max == pytest.approx(middle)
     assert part.effect_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
+    nodes = replace(result, placed_plate=replace(ARTIFACT, map_grid=MapGrid(9, 0.01)))
+    part = parts_of(drawn_up(nodes, error_map=curved)[1])["interpolation"]
+    assert part.effect_max == part.effect_rms == 0
 
 
 def test_noise_is_no_interpolation_error():
