@@ -233,6 +233,7 @@ class SolvingSession:
         if not self._stale or self._incomplete:
             return None
         self._stale = False
+        stamp = max(map(to_model.stamp_ns, self._messages.values()), default=0)
         try:
             measurements = self.measurements()
             digest = session_digest({
@@ -240,9 +241,9 @@ class SolvingSession:
                 for index, parts in self._by_view(measurements.views).items()})
             options = solver_options(self._settings, measurements)
         except SelfcalError as error:
-            self.shown.problem, self.shown.digest = error, ""
+            self.shown = Shown(None, error, self._run, self._views_done, stamp)
+            self._publish_summary()
             raise
-        stamp = max(to_model.stamp_ns(message) for message in self._messages.values())
         return Job(self._run, measurements, options, digest, stamp, self._notes, self._views_done)
 
     def take(self, outcome: Outcome) -> None:
@@ -264,6 +265,7 @@ class SolvingSession:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
         self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns, "")
+        self._publish_summary()
         if not self._unfinished():
             raise outcome.problem or ValueError("neither a result nor a problem")
         self._ports.say(Level.OK, self._state())
@@ -277,27 +279,32 @@ class SolvingSession:
             self._ports.say(Level.ERROR, f"save_path: {error}")
 
     def _publish(self, result: results.CalibrationResult) -> None:
-        shown, frame_id = self.shown, self._settings.frame_id
-        run = shown.run
-        verdict = {"qualified": is_qualified(result), "run_id": run.run_id,
-                   "grade": from_model.grade_number(result)}
+        shown = self.shown
         if shown.problem is None:
             self._ports.publish("map", from_model.error_map(
-                result, shown.stamp_ns, frame_id) | verdict)
-        seen = result.observability
-        to_come = self._planned_views(run) - shown.views_done
-        advice = [f"{counted(to_come, 'view')} to come"] if self._unfinished() else seen.advice
-        self._ports.publish("summary", {
-            "header": from_model.header(shown.stamp_ns, frame_id),
-            "state": short(self._state()), "views_done": shown.views_done,
-            "views_planned": self._planned_views(run),
-            "identifiable": seen.identifiable, "rank_deficiency": seen.deficiency,
-            **summary_numbers(result),
-            "advice": [*advice, *result.warnings], "causes": [
-                cause.text for cause in result.verdict.causes], **verdict})
+                result, shown.stamp_ns, self._settings.frame_id) | _verdict(shown))
+        self._publish_summary()
         if shown.problem is None:  # last, as pictures are slow
             self._ports.publish("markers", {"error_map": result.error_map,
                                             "stamp_ns": shown.stamp_ns})
+
+    def _publish_summary(self) -> None:
+        """Publish what is shown, also that there is no map: an earlier summary says otherwise."""
+        shown, result = self.shown, self.shown.result
+        planned = self._planned_views(shown.run)
+        advice = [f"{counted(planned - shown.views_done, 'view')} to come"]
+        if not self._unfinished():
+            advice = [str(shown.problem)] if result is None else list(result.observability.advice)
+        self._ports.publish("summary", {
+            "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
+            "state": short(self._state()), "views_done": shown.views_done,
+            "views_planned": planned,
+            "identifiable": result is not None and result.observability.identifiable,
+            "rank_deficiency": 0 if result is None else result.observability.deficiency,
+            **summary_numbers(result),
+            "advice": [*advice, *(result.warnings if result else ())],
+            "causes": [cause.text for cause in result.verdict.causes] if result else [],
+            **_verdict(shown)})
 
     def _unfinished(self) -> bool:
         """Return whether remaining views may help.
@@ -381,6 +388,14 @@ class SolvingSession:
                          {"views": self._views_done, "readings": self.digest(),
                           "plan_id": self._run.plan_id, "run_id": self._run.run_id,
                           "left_aside": self._left_aside, "saved": self._saved})
+
+
+def _verdict(shown: Shown) -> dict[str, Any]:
+    """Return the fields of a verdict that map and summary share; without a map it is no good."""
+    result = shown.result
+    return {"qualified": result is not None and is_qualified(result),
+            "run_id": shown.run.run_id,
+            "grade": 0 if result is None else from_model.grade_number(result)}
 
 
 def short(sentence: str) -> str:

@@ -32,6 +32,7 @@ from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
+OTHER_SIGN = (np.kron(np.ones((2, 2)), np.eye(2)) * 1e-8).ravel()  # offsets rise with x, y
 ASSUMED = [term.name for term in DEFAULT_TERMS if term.name != "yaw"]  # which images show
 
 
@@ -121,8 +122,28 @@ def test_terms_that_nobody_knows_are_told_and_the_solver_lives(desk):
     told = f"plan '{PLAN.plan_id}': model_terms: the term 'creep' is unknown"
     assert str(caught.value).startswith(told)
     assert str(desk.session.shown.problem).startswith(told)
+    assert desk.hands.of("summary")[-1]["advice"] == [str(caught.value)]
     desk.take(views_of())
     assert [term.name for term in desk.session.result.model.terms] == ASSUMED
+
+
+def test_a_refusal_replaces_the_summary_of_a_map_and_its_verdict(desk):
+    """The summary is latched: whoever asks at the end must not get that of earlier readings."""
+    views = views_of(run_id="7")
+    desk.session.take_command(command(4, run_id="7"))
+    desk.take(views)
+    assert desk.hands.of("summary")[-1]["qualified"]
+    views[1].motion, views[1].dof_motion = OTHER_SIGN, 50
+    with pytest.raises(InputError) as caught:
+        desk.take([views[1]])
+    last = desk.hands.of("summary")[-1]
+    assert "other sign" in str(caught.value) and last["advice"] == [str(caught.value)]
+    assert str(caught.value).startswith(last["state"].rstrip("."))
+    assert (last["views_done"], last["views_planned"], last["run_id"]) == (4, 4, "7")
+    assert (last["identifiable"], last["qualified"], last["grade"]) == (False, False, 0)
+    assert np.isnan(last["max_error_um"]) and np.isnan(last["rms_uncertainty_um"])
+    assert message("CalibrationSummary", last).state == last["state"]
+    assert len(desk.hands.of("map")) == 1
 
 
 def test_readings_of_two_runs_are_never_mixed(desk):
@@ -222,6 +243,8 @@ def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     desk.take(lines)
     assert desk.hands.said == [
         (Level.OK, "1 of 4 views measured, not yet enough to identify the stage.")]
+    assert desk.hands.of("summary")[-1]["state"] == desk.hands.said[0][1]
+    assert desk.hands.of("summary")[-1]["advice"] == ["3 views to come"]
     assert desk.session.diagnosis().level == Level.OK
     with pytest.raises(NoDataError, match="no grid mark was read"):
         desk.session.save("x.json")

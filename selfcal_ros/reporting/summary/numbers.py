@@ -200,12 +200,16 @@ def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
     return float(sizes.flat[flat]), tuple(int(i) for i in np.unravel_index(flat, sizes.shape))
 
 
-def summary_numbers(result: CalibrationResult) -> dict[str, float]:
+def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
     """Return the numbers of a CalibrationSummary message by the names of its fields.
 
-    Lengths in um, angles in arcsec, NaN where unknown. ``max_error_um`` is the longest error vector
-    |G|, ``rms_error_um`` and ``rms_uncertainty_um`` (k=1) are per axis.
+    Lengths in um, angles in arcsec, NaN where unknown, as all are without a result.
+    ``max_error_um`` is the longest error vector |G|, ``rms_error_um`` and ``rms_uncertainty_um``
+    (k=1) are per axis.
     """
+    if result is None:
+        return dict.fromkeys(("max_error_um", "rms_error_um", "rms_uncertainty_um",
+                              "max_theta_error_arcsec", "rms_theta_uncertainty_arcsec"), math.nan)
     figures = map_figures(result.error_map)
     return {"max_error_um": figures.max_error_m * UM_PER_M,
             "rms_error_um": figures.rms_error_m * UM_PER_M,
