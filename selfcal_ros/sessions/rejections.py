@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Why detections are rejected, reported once it is not merely that other messages are late."""
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
-from selfcal_ros.collection.diagnosis import RejectionFinding
+from selfcal_ros.collection.diagnosis import RejectionFinding, main_reason
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import advice
+from selfcal_ros.collection.inputs import REMEDY, Reason, advice
 from selfcal_ros.sessions.health import Level
 
 PATIENCE_S = 6.0
@@ -37,6 +38,7 @@ class RejectionWatch:
         self._found: dict[Key, tuple[float, str]] = {}  # since when, and the line now
         self._advised: dict[Key, tuple[float, str]] = {}
         self._said: set[Key] = set()
+        self._progress: dict[int, tuple[int, Counter[str]]] = {}  # used, and rejected until then
 
     def take(self, findings: Mapping[int | None, RejectionFinding],
              progress: Mapping[int, ViewProgress], ended: Collection[int], *,
@@ -58,6 +60,9 @@ class RejectionWatch:
         where.update((index, f"view '{view.view.name}': ") for index, view in progress.items())
         found: dict[Key, str] = {
             (index, one.reason): f"{where[index]}{one}" for index, one in findings.items()}
+        for (index, reason), line in self._stuck(progress, ended).items():
+            if not {(index, reason), (None, reason)} & found.keys():
+                found[index, reason] = where[index] + line
         known = found.keys() | self._said
         advised: dict[Key, str] = {
             (index, reason): where[index] + line
@@ -68,6 +73,26 @@ class RejectionWatch:
         self._found = _since(now, self._found, found)
         self._advised = _since(now, self._advised, advised)
         self.tell()
+
+    def _stuck(self, progress: Mapping[int, ViewProgress],
+               ended: Collection[int]) -> dict[Key, str]:
+        """Return why detections are rejected since the last one of an open view was used.
+
+        Where the marks are read and the lines are not, they need not be most of the view.
+        """
+        lines = {}
+        for index in progress.keys() - ended:
+            readings = progress[index].readings
+            rejected = Counter(readings.rejected)
+            if self._progress.get(index, (-1,))[0] != readings.used:
+                self._progress[index] = readings.used, rejected
+            since = rejected - self._progress[index][1]
+            main = main_reason(since, 0)
+            if main is not None:
+                reason, count, total = main
+                lines[index, reason] = (f"none of the last {total} detections was used, {count} "
+                                        f"were rejected as {reason}: {REMEDY[Reason(reason)]}")
+        return lines
 
     def tell(self) -> None:
         """Log each cause that has lasted, once."""

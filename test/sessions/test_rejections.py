@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.collection.inputs import Command, EncoderSample
+from selfcal_ros.collection.diagnosis import AT_LEAST
+from selfcal_ros.collection.inputs import (
+    REMEDY,
+    Command,
+    Detection,
+    EncoderSample,
+    Kind,
+    Phase,
+    Reason,
+)
 from selfcal_ros.messages import from_model
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
@@ -133,3 +142,28 @@ def test_the_time_is_counted_anew_when_a_fault_comes_again():
         cell.session.tick()
     [line] = cell.hands.lines(Level.WARN)
     assert line.startswith("15 of 25 detections were rejected as no_encoder_sample_near")
+
+
+def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected():
+    """The marks are read; the lines that remain are seen again and again, and never used."""
+    cell, events = Late(), scene("0", count=8).events
+    lost = [event for event in events if isinstance(event, Detection) and event.k == 3
+            and event.kind == Kind.ANGULAR]
+    cell.give(event for event in events if event not in lost and not (
+        isinstance(event, Command) and event.phase == Phase.DONE))
+    cell.session.tick()
+    for number in range(AT_LEAST):
+        cell.give([replace(lost[0], offset_theta=0.3 + number * 1e-6)])
+        cell.hands.pass_time(PATIENCE_S - STEP_S)
+        cell.session.tick()
+    assert cell.hands.said == []
+    cell.hands.pass_time(PATIENCE_S)
+    cell.session.tick()
+    [line] = cell.hands.lines(Level.WARN)
+    assert line == (f"view '0': none of the last {AT_LEAST} detections was used, {AT_LEAST} were "
+                    f"rejected as too_far_from_nominal: {REMEDY[Reason.TOO_FAR]}")
+    assert line in cell.session.diagnosis(detections_matched=True).message
+    cell.give(lost)
+    cell.hands.pass_time(STEP_S)
+    cell.session.tick()
+    assert "none of the last" not in cell.session.diagnosis(detections_matched=True).message
