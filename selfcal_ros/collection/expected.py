@@ -176,7 +176,10 @@ class ViewProgress:
 
     @property
     def coverage(self) -> float:
-        """Fraction of the expected marks and checks that are complete, 0..1."""
-        expected = self.grid_expected + self.angular_expected + self.check_expected
-        done = self.grid_done + self.angular_done + self.check_done
-        return done / expected if expected else 1.0
+        """Fraction of the readings and checks to be made that is there, 0..1.
+
+        Marks that are complete would be none until the last pass over the plate.
+        """
+        wanted = (self.view.repeats * (self.grid_expected + self.angular_expected)
+                  + self.check_expected)
+        return 1 - self.needed / wanted if wanted else 1.0

@@ -280,7 +280,7 @@ class CollectingSession:
         self._since_ns = self.collector.timeline.intervals[-1].start_ns
         self._state = "between views" if index is None else (
             f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
-            "marks read")
+            "readings taken")
 
     def diagnosis(self, *, detections_matched: bool) -> Diagnosis:
         """Return the diagnosis of the node.

@@ -101,7 +101,7 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
 MEASURED = {
     "health": {"pose_sequencer": told("MEASURING", views="4", plan_id="hu", run_id="17"),
                "solver": told("", saved="/results/hu_17.json"),
-               "measurement_collector": told("", "view 'rot90': 35 % of the marks read")},
+               "measurement_collector": told("", "view 'rot90': 35 % of the readings taken")},
     "command": COMMAND | {"phase": "MEASURE"},
     "view": {"view_name": "rot90", "complete": False, "grid": [430, 441], "angular": [3, 8],
              "checks": [0, 0],

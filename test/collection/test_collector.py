@@ -389,7 +389,7 @@ def test_collecting_early_does_not_change_what_is_collected_later():
 def test_a_view_that_asks_for_nothing_in_the_field_is_covered():
     readings = ViewReadings(View("off"))
     assert ViewProgress(0, readings.view, 0, 0, 0, 0, readings, 0).coverage == 1.0
-    assert ViewProgress(0, readings.view, 3, 1, 5, 1, readings, 0).coverage == 0.25
+    assert ViewProgress(0, readings.view, 3, 0, 5, 0, readings, 0).coverage == 0.0
 
 
 def test_progress_counts_marks_and_repeats():
@@ -402,8 +402,17 @@ def test_progress_counts_marks_and_repeats():
     _, progress = collect(cell.events)
     assert progress[0].grid_done == 19
     assert not progress[0].complete
-    assert progress[0].coverage == pytest.approx(27 / 28)
+    assert progress[0].coverage == pytest.approx(55 / 56)
     assert found.views[0].used == 56
+
+
+def test_the_first_of_two_passes_over_the_plate_is_half_of_the_view():
+    """No mark is read as often as the plan asks, and the operator is to see that it goes on."""
+    cell = scene(repeats=2)
+    first = {mark_of(one): one for one in reversed(cell.detections)}
+    cell.detections = list(first.values())
+    _, progress = collect(cell.events)
+    assert (progress[0].grid_done, progress[0].coverage) == (0, 0.5)
 
 
 def test_the_encoder_was_heard_from_its_first_joint_to_its_last():

@@ -97,7 +97,7 @@ def test_an_outlier_among_check_stops_is_one_and_leaves_the_mark_unchecked():
     readings, progress = progress_of(scene)
     assert readings.rejected == {"outlier_among_repeats": 1}
     assert (progress.complete, progress.check_done, progress.grid_done) == (False, 4, 25)
-    assert progress.coverage == 29 / 30
+    assert progress.coverage == 79 / 80
 
 
 def test_check_stops_are_no_repeats():

@@ -252,7 +252,7 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
         graph.until(lambda number=number: node.session.collector.received["command"] == 2 + number,
                     "the command")
     graph.until(lambda: diagnostics[-1].status[0].message == (
-        "the encoder is not heard; view '0': 0 % of the marks read"), "a view that is whole")
+        "the encoder is not heard; view '0': 0 % of the readings taken"), "a view that is whole")
 
 
 @pytest.mark.usefixtures("quick_beat")
