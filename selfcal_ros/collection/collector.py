@@ -6,7 +6,7 @@ The result is a function of the set of messages alone, so that live nodes, a rep
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -237,6 +237,13 @@ class Collector:
             return {}
         return self._seen.findings({index: view.readings for index, view in progress.items()},
                                    measurements.rejected)
+
+    def finding_of_last(self, progress: Mapping[int, ViewProgress], index: int,
+                        rejected: Mapping[str, int]) -> RejectionFinding | None:
+        """Return why the last detections of a view were rejected, none of which was used."""
+        if self._seen is None:
+            return None
+        return self._seen.of_last(index, progress[index].readings, rejected)
 
     def _facts(self) -> EncoderFacts:
         """Return a summary of the encoder messages."""

@@ -305,6 +305,12 @@ class DetectionsSeen:
     rules: IdentityRules
     sense: Sense
 
+    def of_last(self, index: int, readings: ViewReadings,
+                rejected: Mapping[str, int]) -> RejectionFinding | None:
+        """Return why the last detections of a view were rejected, none of which was used."""
+        marks = self._named({index: readings}) if rejected.keys() & set(PLACED) else {}
+        return diagnose(self._evidence(rejected, 0, marks, joints=False, lies="", view=index))
+
     def findings(self, views: Mapping[int, ViewReadings], loose: Mapping[str, int],
                  ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.

@@ -6,6 +6,7 @@ import statistics
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -223,7 +224,7 @@ class CollectingSession:
         ended = [index for index, view in progress.items()
                  if final or view.end_ns <= timeline.last_stamp_ns]
         self._rejections.take(self.collector.findings(measurements, progress), progress, ended,
-                              final=final)
+                              partial(self.collector.finding_of_last, progress), final=final)
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete

@@ -4,9 +4,9 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
-from selfcal_ros.collection.diagnosis import RejectionFinding, main_reason
+from selfcal_ros.collection.diagnosis import RejectionFinding
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import REMEDY, Reason, advice
+from selfcal_ros.collection.inputs import advice
 from selfcal_ros.sessions.health import Level
 
 PATIENCE_S = 6.0
@@ -16,6 +16,8 @@ have come, it is rejected or counted in another view."""
 
 Key = tuple[int | None, str]
 """View, None = all, and reason of rejection."""
+OfLast = Callable[[int, Mapping[str, int]], RejectionFinding | None]
+"""Return why the last detections of a view, rejected for these reasons, were rejected."""
 
 
 class RejectionWatch:
@@ -41,7 +43,7 @@ class RejectionWatch:
         self._progress: dict[int, tuple[int, Counter[str]]] = {}  # used, and rejected until then
 
     def take(self, findings: Mapping[int | None, RejectionFinding],
-             progress: Mapping[int, ViewProgress], ended: Collection[int], *,
+             progress: Mapping[int, ViewProgress], ended: Collection[int], of_last: OfLast, *,
              final: bool = False) -> None:
         """Take what is found now.
 
@@ -53,6 +55,8 @@ class RejectionWatch:
             view_index -> progress.
         ended : collection of int
             Views that are over: single rejections with a remedy are reported as well.
+        of_last : callable (view_index, rejected)
+            Returns why the last detections of a view were rejected, none of which was used.
         final : bool
             Whether all messages have come: nothing is waited for.
         """
@@ -60,9 +64,10 @@ class RejectionWatch:
         where.update((index, f"view '{view.view.name}': ") for index, view in progress.items())
         found: dict[Key, str] = {
             (index, one.reason): f"{where[index]}{one}" for index, one in findings.items()}
-        for (index, reason), line in self._stuck(progress, ended).items():
-            if not {(index, reason), (None, reason)} & found.keys():
-                found[index, reason] = where[index] + line
+        for index, rejected in self._since_used(progress, ended).items():
+            one = of_last(index, rejected)
+            if one and not {(index, one.reason), (None, one.reason)} & found.keys():
+                found[index, one.reason] = f"{where[index]}none of the last ones was used: {one}"
         known = found.keys() | self._said
         advised: dict[Key, str] = {
             (index, reason): where[index] + line
@@ -74,25 +79,20 @@ class RejectionWatch:
         self._advised = _since(now, self._advised, advised)
         self.tell()
 
-    def _stuck(self, progress: Mapping[int, ViewProgress],
-               ended: Collection[int]) -> dict[Key, str]:
-        """Return why detections are rejected since the last one of an open view was used.
+    def _since_used(self, progress: Mapping[int, ViewProgress],
+                    ended: Collection[int]) -> dict[int, Counter[str]]:
+        """Return what was rejected of each open view since one of its detections was used.
 
-        Where the marks are read and the lines are not, they need not be most of the view.
+        Where the marks are read and the lines are not, that need not be most of the view.
         """
-        lines = {}
+        since = {}
         for index in progress.keys() - ended:
             readings = progress[index].readings
             rejected = Counter(readings.rejected)
             if self._progress.get(index, (-1,))[0] != readings.used:
                 self._progress[index] = readings.used, rejected
-            since = rejected - self._progress[index][1]
-            main = main_reason(since, 0)
-            if main is not None:
-                reason, count, total = main
-                lines[index, reason] = (f"none of the last {total} detections was used, {count} "
-                                        f"were rejected as {reason}: {REMEDY[Reason(reason)]}")
-        return lines
+            since[index] = rejected - self._progress[index][1]
+        return since
 
     def tell(self) -> None:
         """Log each cause that has lasted, once."""

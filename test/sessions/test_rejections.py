@@ -160,10 +160,30 @@ def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected()
     cell.hands.pass_time(PATIENCE_S)
     cell.session.tick()
     [line] = cell.hands.lines(Level.WARN)
-    assert line == (f"view '0': none of the last {AT_LEAST} detections was used, {AT_LEAST} were "
-                    f"rejected as too_far_from_nominal: {REMEDY[Reason.TOO_FAR]}")
+    assert line == (f"view '0': none of the last ones was used: {AT_LEAST} of {AT_LEAST} "
+                    f"detections were rejected as too_far_from_nominal: {REMEDY[Reason.TOO_FAR]}")
     assert line in cell.session.diagnosis(detections_matched=True).message
     cell.give(lost)
     cell.hands.pass_time(STEP_S)
     cell.session.tick()
     assert "none of the last" not in cell.session.diagnosis(detections_matched=True).message
+
+
+def test_lines_without_their_joint_are_told_although_the_marks_are_more():
+    cell, events = Late(), scene("0", count=8).events
+    lines = [event for event in events if isinstance(event, Detection)
+             and event.kind == Kind.ANGULAR]
+    cell.give(replace(event, names=event.names[:2], positions=event.positions[:2], velocities=())
+              if isinstance(event, EncoderSample) else event
+              for event in events if event not in lines[1:] and not (
+                  isinstance(event, Command) and event.phase == Phase.DONE))
+    cell.session.tick()
+    cell.give(lines[1:])
+    for _ in range(2):
+        cell.hands.pass_time(PATIENCE_S)
+        cell.session.tick()
+    [line] = cell.hands.lines(Level.WARN)
+    assert line == (
+        "view '0': none of the last ones was used: 7 of 7 detections were rejected as no_encoder_"
+        "sample_near: no encoder sample of the joint 'theta' came; names that came: 'x', 'y'; set "
+        "joint_x, joint_y, joint_theta")
