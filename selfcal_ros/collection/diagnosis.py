@@ -33,6 +33,9 @@ SCALES = {1.0: "", 1e3: "1000 times what the marks ask for: they are in mm",
           1e-3: "a thousandth of what the marks ask for: they are in km, or their unit is unknown",
           1e6: "a million times what the marks ask for: they are in µm"}
 """Indicated position over true position -> meaning."""
+UNUSABLE = {Reason.ENCODER_MALFORMED: "give each name of a joint state its position",
+            Reason.ENCODER_NOT_FINITE: "publish positions that are finite"}
+"""Encoder samples that cannot be used -> remedy."""
 PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTION,
           Reason.NOT_IN_VIEW, Reason.AMBIGUOUS, Reason.OUTLIER, Reason.ROTATION)
 """Reasons possibly caused by a stage away from all marks."""
@@ -40,6 +43,9 @@ PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTIO
 Span = tuple[int, int] | None
 FAR_M = 1e9
 """Distance beyond which a number is no place, whatever its unit."""
+STOPPED = 20
+"""Number of the last marks of a view at all of which a stage that no longer moves is indicated at
+one place."""
 LOOKED_AT = 2000
 """Number of the last detections of a view whose stage positions are examined."""
 
@@ -139,6 +145,10 @@ def diagnose(evidence: Evidence) -> RejectionFinding | None:
 def _joints(e: Evidence) -> str | None:
     if not e.missing_joints:
         return None
+    for reason, remedy in UNUSABLE.items():
+        if e.rejected.get(reason) and not e.seen_joints:
+            return (f"no encoder sample came that can be used, {e.rejected[reason]} were rejected "
+                    f"as {reason}; {remedy}")
     seen = ", ".join(repr(name) for name in e.seen_joints) or "none"
     missing = ", ".join(repr(name) for name in e.missing_joints)
     return (f"no encoder sample of the joint {missing} came; names that came: {seen}; set joint_x, "
@@ -182,6 +192,9 @@ def _seconds(offset_s: float) -> str:
 
 def _stage(e: Evidence) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
+    stopped = _stopped(e)
+    if stopped:
+        return stopped
     joints = wrong_joints(e) if e.joints else None
     if e.lies and len(e.marks) == 1:
         return "; or, if it lies as planned: ".join(filter(None, (e.lies, joints)))
@@ -193,13 +206,30 @@ def _stage(e: Evidence) -> str | None:
     where = np.concatenate([view.stage for view in e.marks]) * e.pitch_m
     middle = complex(np.median(where.real), np.median(where.imag))
     if np.quantile(np.abs(where - middle), 0.9) < e.pitch_m / 4:
-        middle *= -1 if e.sense is Sense.PLATE_MOVES else 1
-        return (f"the stage did not move: it is indicated at x = {middle.real:.6g} m, y = "
-                f"{middle.imag:.6g} m at all of them; name the joints that move, in joint_x and "
-                "joint_y")
+        return (f"the stage did not move: it is indicated at {_place(e, middle)} at all of them; "
+                "name the joints that move, in joint_x and joint_y")
     check = "joint_x and joint_y, " if e.joints else ""
     return (f"the stage stands {away:.3g} m from the sites of the marks that are seen (median); "
             f"check {check}the ids of the marks and how the plate lies")
+
+
+def _stopped(e: Evidence) -> str | None:
+    """Return that the encoder stands still since some mark; not if it never moved."""
+    for view in e.marks:
+        stage, sites = view.stage[-STOPPED:], view.sites[-STOPPED:]
+        still = len(stage) == STOPPED and np.abs(stage - stage[-1]).max() < 1 / 4
+        moved = np.abs(view.stage - stage[-1]).max() > 1 / 2
+        if still and moved and np.abs(sites - sites[-1]).max() > 1:
+            return (f"the stage has stopped: it is indicated at {_place(e, stage[-1] * e.pitch_m)} "
+                    f"at each of the last {STOPPED} marks; check the encoder and what publishes "
+                    "its joints")
+    return None
+
+
+def _place(e: Evidence, stage_m: complex) -> str:
+    """Return where the stage is indicated, from its place in the sense of the measurement."""
+    sign = -1 if e.sense is Sense.PLATE_MOVES else 1
+    return f"x = {sign * stage_m.real:.6g} m, y = {sign * stage_m.imag:.6g} m"
 
 
 def wrong_joints(e: Evidence) -> str | None:

@@ -205,6 +205,33 @@ def test_a_parked_stage():
         "joint_x and joint_y")
 
 
+@pytest.mark.parametrize("sense", list(Sense))
+def test_an_encoder_that_stands_still_within_a_view(sense):
+    """The first marks agree with the plan, so that the ids and the plate are not to blame."""
+    cell = scene(count=0, repeats=3, sense=sense)
+    last = cell.detections[30].stamp_ns
+    place = next(s.positions for s in cell.samples if s.stamp_ns > last)
+    cell.samples = [s if s.stamp_ns < last else replace(s, positions=place, velocities=())
+                    for s in cell.samples]
+    found = findings(cell.events, measurement_sense=str(sense))[None]
+    where = f"x = {place[0]:.6g} m, y = {place[1]:.6g} m"
+    assert f"stage_not_at_mark: the stage has stopped: it is indicated at {where} at each" in found
+    assert "of the last 20 marks; check the encoder and what publishes its joints" in found
+
+
+@pytest.mark.parametrize(("positions", "said"), [
+    ((), "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample came "
+     "that can be used, {} were rejected as encoder_sample_malformed; give each name of a joint "
+     "state its position"),
+    ((np.nan, np.inf, np.nan), "25 of 25 detections were rejected as no_encoder_sample_near: no "
+     "encoder sample came that can be used, {} were rejected as encoder_sample_not_finite; "
+     "publish positions that are finite")])
+def test_joint_states_that_cannot_be_used(positions, said):
+    cell = scene(count=0)
+    cell.samples = [replace(s, positions=positions, velocities=()) for s in cell.samples]
+    assert findings(cell.events) == {None: said.format(len(cell.samples))}
+
+
 def test_positions_that_nothing_explains():
     found = findings(with_positions(scene(count=0), lambda x, y: (x + 0.05, 2 * y)))[None]
     assert "the stage stands 0.0" in found
