@@ -292,7 +292,8 @@ def worded(fault: WiringFault) -> WiringError:
     if any(response.crossed for response in responses):
         what = "exchanged axes: " + " and ".join(
             f"offset_{r.offset} follows {r.axis}" for r in responses)
-        remedy = "publish offsets along the stage's axes, mark - optical axis"
+        remedy = ("publish offsets along the stage's axes, mark - optical axis; or, if the joints "
+                  "are exchanged, correct joint_x and joint_y")
     elif any(response.slope > 0 for response in responses):
         what = "offsets of the other sign: " + names + (
             " rise" if len(responses) > 1 else " rises") + " where the optical axis moves on"

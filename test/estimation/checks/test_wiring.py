@@ -245,6 +245,13 @@ def test_a_session_with_wrong_offsets_is_refused(sense, with_ids, spoilt, expect
         calibrate(readings)
 
 
+def test_exchanged_joints_look_the_same_as_exchanged_offsets():
+    readings = measured_session(exchanged, sense=Sense.MICROSCOPE_MOVES, with_ids=True)
+    lines = {str(worded(fault)) for fault in wiring_faults(readings)}
+    assert lines and all(line.endswith("; or, if the joints are exchanged, correct joint_x and "
+                                       "joint_y") for line in lines)
+
+
 @BOTH_WAYS
 @NAMED
 def test_a_session_with_good_offsets_is_calibrated(sense, with_ids):
