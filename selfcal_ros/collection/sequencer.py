@@ -77,7 +77,10 @@ class Sequencer:
 
     def confirm(self) -> list[Command]:
         """Measure: the plate is placed."""
-        self._need(State.PLACING, "confirm_view")
+        if self.state is not State.PLACING:
+            raise InputError("pose_sequencer", f"confirm_view does not fit while {self.state}",
+                             "redo_view has the plate placed again"
+                             if self.state is State.MEASURING else "start a plan first")
         self.state = State.MEASURING
         return [self._command(Phase.MEASURE)]
 
@@ -120,11 +123,6 @@ class Sequencer:
     def foreign_command(self) -> None:
         """Follow another publisher's command: recorded commands take precedence."""
         self.state = State.FOLLOWING
-
-    def _need(self, state: State, request: str) -> None:
-        if self.state is not state:
-            raise InputError("pose_sequencer", f"{request} does not fit while {self.state}",
-                             "see selfcal/view_command for what is expected")
 
     def _place(self) -> list[Command]:
         self.state = State.PLACING

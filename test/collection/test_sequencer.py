@@ -137,3 +137,11 @@ def test_the_sequencer_yields_to_recorded_commands_in_any_state():
         sequencer = sequencer_in(state)
         sequencer.foreign_command()
         assert sequencer.state is State.FOLLOWING
+
+
+@pytest.mark.parametrize(("state", "remedy"), [
+    (State.IDLE, "start a plan first"), (State.DONE, "start a plan first"),
+    (State.MEASURING, "redo_view has the plate placed again")])
+def test_a_confirmation_out_of_place_says_what_to_do(state, remedy):
+    with pytest.raises(InputError, match=f"confirm_view does not fit while {state}; {remedy}$"):
+        sequencer_in(state).confirm()
