@@ -146,7 +146,8 @@ class SolvingSession:
         ends = command.phase == Phase.DONE and run not in self._ended
         if ends:
             self._ended.add(run)
-        tells = not self._planned_views(run) or isinstance(self.shown.problem, NoDataError)
+        tells = not self._planned_views(run) or isinstance(
+            self.shown.problem, NoDataError | NotIdentifiableError)
         if run in (self._run, Run(self._run.plan_id)) and (
                 command.views_planned > known or (ends and tells)):
             self._stale = True  # the summary shows the number of planned or remaining views
@@ -314,11 +315,11 @@ class SolvingSession:
         view.
         """
         run, problem = self.shown.run, self.shown.problem
-        planned = self._planned_views(run)
+        to_come = self.shown.views_done < self._planned_views(run)
+        over = bool(self._ended & {run, Run(run.plan_id)})
         if isinstance(problem, NoDataError):
-            over = bool(self._ended & {run, Run(run.plan_id)})
-            return not over or self.shown.views_done < planned
-        return isinstance(problem, NotIdentifiableError) and self.shown.views_done < planned
+            return not over or to_come
+        return isinstance(problem, NotIdentifiableError) and to_come and not over
 
     def _state(self) -> str:
         if self._unfinished():

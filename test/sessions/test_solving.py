@@ -236,6 +236,20 @@ def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(desk, pla
         desk.session.save("x.json")
 
 
+def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
+    """A view that was skipped before anything was read never comes."""
+    desk.session.take_command(command(4, run_id="7"))
+    desk.take(views_of(run_id="7")[:1])
+    assert desk.hands.of("summary")[-1]["advice"] == ["3 views to come"]
+    desk.session.take_command(command(4, run_id="7", phase=Phase.DONE))
+    assert desk.solve()
+    last = desk.hands.of("summary")[-1]
+    assert (last["views_done"], last["views_planned"]) == (1, 4)
+    assert "do not identify the stage" in last["state"]
+    assert last["advice"] == list(desk.session.result.observability.advice) != []
+    assert desk.session.diagnosis().level == Level.WARN
+
+
 def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     lines = views_of()[3:]
     assert [len(view.m) for view in lines] == [0]
