@@ -38,6 +38,7 @@ class CalibrationAction:
 
     def __init__(self, node: ManagedNode[SequencerSettings], session: SequencingSession) -> None:
         self._node, self._session = node, session
+        self._taken = False  # from the acceptance of a goal, before it is executed, to its end
         self._goal: Any = None
         self._ended: Future | None = None
         self._saved: Future | None = None
@@ -65,10 +66,12 @@ class CalibrationAction:
                 coverage=self._session.coverage))
 
     def _on_goal(self, _: Any) -> GoalResponse:
-        if self._session.ended and self._goal is None:
+        if self._session.ended and not self._taken:
+            self._taken = True
             return GoalResponse.ACCEPT
-        self._node.say(Level.WARN, f"goal rejected while {self._session.machine.state}: abort the "
-                       "plan first")
+        why = ("another one is executed: cancel it, or wait for its end" if self._taken else
+               f"{self._session.machine.state}: abort the plan first")
+        self._node.say(Level.WARN, f"goal rejected while {why}")
         return GoalResponse.REJECT
 
     def _on_end(self) -> None:
@@ -94,7 +97,7 @@ class CalibrationAction:
             result.error_code = int(code)
             goal.abort()
         finally:
-            self._goal, self._ended = None, None
+            self._goal, self._ended, self._taken = None, None, False
         return result
 
     async def _conclude(self, goal: Any, result: Any) -> None:

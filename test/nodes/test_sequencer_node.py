@@ -324,6 +324,16 @@ def test_a_second_goal_is_rejected_and_the_first_goes_on(actor):
     assert actor.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
+def test_of_two_goals_that_come_at_once_one_is_rejected(actor):
+    """Both were accepted before one was executed, and the result of the first never came."""
+    sent = [actor.client.send_goal_async(RunCalibration.Goal()) for _ in range(2)]
+    handles = [actor.graph.finish(future, "the goal's response") for future in sent]
+    assert sorted(handle.accepted for handle in handles) == [False, True]
+    actor.measure_all()
+    first = next(handle for handle in handles if handle.accepted)
+    assert actor.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
 def test_a_goal_after_a_goal(actor):
     for _ in range(2):
         actor.heard.clear()
