@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from selfcal_ros.collection import inputs
-from selfcal_ros.collection.diagnosis import DetectionsSeen, EncoderFacts, RejectionFinding
+from selfcal_ros.collection.diagnosis import RejectionFinding
 from selfcal_ros.collection.encoder import NEVER, JointTrack, TrackLimits
+from selfcal_ros.collection.evidence import DetectionsSeen, EncoderFacts
 from selfcal_ros.collection.expected import ViewProgress, expected_marks, n_read_enough
 from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.marks.identify import IdentityRules

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The detections of a session with the stage at their exposures, as evidence of what is wrong."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from selfcal_ros.collection.diagnosis import (
+    PLACED,
+    Evidence,
+    RejectionFinding,
+    Span,
+    diagnose,
+    wrong_joints,
+)
+from selfcal_ros.collection.exposures import Exposures
+from selfcal_ros.collection.inputs import Kind
+from selfcal_ros.collection.marks.identify import IdentityRules
+from selfcal_ros.collection.marks.seen_poses import (
+    NamedMarks,
+    mirrored_alike,
+    seen_poses,
+    texts,
+)
+from selfcal_ros.collection.marks.stops import places_of_cells
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense, ViewReadings
+
+FAR_M = 1e9
+"""Distance beyond which a number is no place, whatever its unit."""
+LOOKED_AT = 2000
+"""Number of the last detections of a view whose stage positions are examined."""
+
+
+@dataclass(frozen=True)
+class EncoderFacts:
+    """Summary of the encoder messages.
+
+    Attributes
+    ----------
+    names : dict
+        Axis -> name of its joint.
+    sampled : dict
+        Axis -> whether it has samples.
+    foreign : tuple of str
+        Other joint names received.
+    span_ns : tuple of int or None
+        First and last stamp.
+    step_s, max_gap_s : float
+        Usual time between samples of x, NaN if unknown, and the largest allowed.
+    """
+
+    names: Mapping[str, str]
+    sampled: Mapping[str, bool]
+    foreign: tuple[str, ...]
+    span_ns: Span
+    step_s: float
+    max_gap_s: float
+
+
+@dataclass(frozen=True)
+class DetectionsSeen:
+    """All detections of a session with the stage at their exposures.
+
+    Attributes
+    ----------
+    table : structured array of `reduce.DETECTION`
+        The detections.
+    view_of : int array
+        View of each, -1 for none.
+    exposures : Exposures
+        The stage at their instants.
+    encoder : callable
+        Returns the `EncoderFacts`; called only if there is a fault.
+    commands_ns : tuple of int
+        First and last stamp of the commands.
+    artifact : Artifact
+        The plate.
+    rules : IdentityRules
+        Limits of identification.
+    sense : Sense
+        Sense of measurement.
+    """
+
+    table: np.ndarray
+    view_of: np.ndarray
+    exposures: Exposures
+    encoder: Callable[[], EncoderFacts]
+    commands_ns: Span
+    artifact: Artifact
+    rules: IdentityRules
+    sense: Sense
+
+    def of_last(self, index: int, readings: ViewReadings,
+                rejected: Mapping[str, int]) -> RejectionFinding | None:
+        """Return why the last detections of a view were rejected, none of which was used."""
+        marks = self._named({index: readings}) if rejected.keys() & set(PLACED) else {}
+        return diagnose(self._evidence(rejected, 0, marks, joints=False, lies="", view=index))
+
+    def findings(self, views: Mapping[int, ViewReadings], loose: Mapping[str, int],
+                 ) -> dict[int | None, RejectionFinding]:
+        """Return why most detections of the session (key None), or of single views, were rejected.
+
+        Parameters
+        ----------
+        views : dict
+            view_index -> readings.
+        loose : dict
+            Reason -> detections that belong to no view.
+        """
+        rejected = dict(loose)
+        for readings in views.values():
+            for reason, count in readings.rejected.items():
+                rejected[reason] = rejected.get(reason, 0) + count
+        used = sum(readings.used for readings in views.values())
+        marks = self._named(views) if rejected.keys() & set(PLACED) else {}
+        limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
+        seen = seen_poses(marks, limit, self.rules.max_rotation_rad)
+        joints, told = not any(one.planned for one in seen.values()), texts(seen)
+        alike = (told.get(next(iter(views)), "") if len(views) == 1
+                 else mirrored_alike(seen.values()))
+        whole = self._evidence(rejected, used, marks, joints=joints, lies=alike)
+        finding = diagnose(whole)
+        found: dict[int | None, RejectionFinding | None] = {index: diagnose(self._evidence(
+            readings.rejected, readings.used, {i: marks[i] for i in marks if i == index},
+            joints=joints and not told, lies=told.get(index, ""), view=index))
+            for index, readings in views.items()}
+        named = {index: one for index, one in found.items() if one is not None}
+        if finding is None or (not alike and told.keys() & named.keys() and not (
+                finding.reason in PLACED and joints and wrong_joints(whole))):
+            return named
+        return {None: finding}
+
+    def _evidence(self, rejected: Mapping[str, int], used: int, marks: Mapping[int, NamedMarks], *,
+                  joints: bool, lies: str, view: int | None = None) -> Evidence:
+        """Return the facts on a view, or on all."""
+        here = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
+        table, encoder = self.table[here], self.encoder()
+        kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
+        missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
+                        if not encoder.sampled[axis] and (table["kind"] == kind).any())
+        came = (*(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
+                *encoder.foreign)
+        return Evidence(
+            rejected, used, missing, came, _span(table["stamp"]), encoder.span_ns,
+            self.commands_ns, encoder.step_s, encoder.max_gap_s, tuple(marks.values()),
+            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies,
+            joints)
+
+    def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
+        """Return view_index -> the last of its marks with ids, as `sense` has them."""
+        found, pitch = {}, self.artifact.grid_pitch_m
+        for index, readings in views.items():
+            table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
+            stage = self.exposures.at(table["stamp"])
+            where = stage.x.position + 1j * stage.y.position
+            good = (table["kind"] == Kind.GRID) & table["has_id"] & (np.abs(where) < FAR_M)
+            good &= np.hypot(table["ox"], table["oy"]) < FAR_M
+            good &= self.artifact.has(table["m"], table["n"])
+            if not (good.any() and readings.view.grid):
+                continue
+            x, y = self.artifact.places(table["m"][good], table["n"][good])
+            offset = np.stack([table["ox"][good], table["oy"][good]])
+            cells = places_of_cells(readings.view, offset)
+            sign = -1 if self.sense is Sense.PLATE_MOVES else 1
+            found[index] = NamedMarks(
+                readings.view.name, readings.view.on_stage(self.artifact), x + 1j * y,
+                sign * where[good] / pitch, _complex(cells) / pitch,
+                _complex(offset - cells) / pitch, listed=self.artifact.marks is not None)
+        return found
+
+
+def _complex(values: np.ndarray) -> np.ndarray:
+    return values[0] + 1j * values[1]
+
+
+def _span(stamps_ns: Iterable[int]) -> Span:
+    stamps = np.asarray(stamps_ns)
+    return (int(stamps.min()), int(stamps.max())) if len(stamps) else None
