@@ -25,6 +25,8 @@ from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
+ECHO_LENGTH = 128
+"""Length of a string shown by `ros2 topic echo`."""
 Fields = dict[str, Any]
 
 
@@ -190,6 +192,15 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "identifiable": result.observability.identifiable,
         "qualified": result.verdict.qualified, "run_id": result.run_id,
         "grade": grade_number(result), "interpolation": result.interpolation}
+
+
+def short(sentence: str) -> str:
+    """Return a sentence without trailing clauses that `ros2 topic echo` would truncate."""
+    if len(sentence) <= ECHO_LENGTH:
+        return sentence
+    head = sentence[:ECHO_LENGTH]
+    end = max(head.rfind(mark) for mark in ("; ", ", ", ": "))
+    return (head[:end] if end > 0 else head[:-1]) + "."
 
 
 def grade_number(result: CalibrationResult) -> int:

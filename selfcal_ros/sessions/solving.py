@@ -26,9 +26,6 @@ from selfcal_ros.sessions.compensating import is_qualified, read_result, result_
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 
-ECHO_LENGTH = 128
-"""Length of a string shown by `ros2 topic echo`."""
-
 
 @dataclass(frozen=True, eq=False)
 class Job:
@@ -298,7 +295,7 @@ class SolvingSession:
             advice = [str(shown.problem)] if result is None else list(result.observability.advice)
         self._ports.publish("summary", {
             "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
-            "state": short(self._state()), "views_done": shown.views_done,
+            "state": from_model.short(self._state()), "views_done": shown.views_done,
             "views_planned": planned,
             "identifiable": result is not None and result.observability.identifiable,
             "rank_deficiency": 0 if result is None else result.observability.deficiency,
@@ -397,12 +394,3 @@ def _verdict(shown: Shown) -> dict[str, Any]:
     return {"qualified": result is not None and is_qualified(result),
             "run_id": shown.run.run_id,
             "grade": 0 if result is None else from_model.grade_number(result)}
-
-
-def short(sentence: str) -> str:
-    """Return a sentence without trailing clauses that `ros2 topic echo` would truncate."""
-    if len(sentence) <= ECHO_LENGTH:
-        return sentence
-    head = sentence[:ECHO_LENGTH]
-    end = max(head.rfind(mark) for mark in ("; ", ", ", ": "))
-    return (head[:end] if end > 0 else head[:-1]) + "."

@@ -28,7 +28,7 @@ from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.compensating import read_result
-from selfcal_ros.sessions.solving import Outcome, short
+from selfcal_ros.sessions.solving import Outcome
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan
 
@@ -96,7 +96,7 @@ def test_the_state_is_a_sentence_that_topic_echo_shows_whole(solve):
     ("Short.", "Short."), ("a" * 100 + "; " + "b" * 40 + ".", "a" * 100 + "."),
     ("a" * 60 + ", b; " + "c" * 80, "a" * 60 + ", b."), ("a" * 200, "a" * 127 + ".")])
 def test_a_long_sentence_ends_with_a_clause(sentence, shown):
-    assert short(sentence) == shown
+    assert from_model.short(sentence) == shown
 
 
 def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):
