@@ -24,6 +24,25 @@ SETTLED = 60
 """Iterations that remove an active table; its slope is below a quarter."""
 
 
+class Covering:
+    """A correction that goes on beyond its nodes: what it adds, and the field of its nodes.
+
+    Parameters
+    ----------
+    add : Correction
+        What the controller adds.
+    x, y : tuple of float
+        First and last node along x and y, in the unit of the frame.
+    """
+
+    def __init__(self, add: Correction, x: tuple[float, float], y: tuple[float, float]) -> None:
+        self._add, self.field = add, tuple((min(ends), max(ends)) for ends in (x, y))
+
+    def __call__(self, px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the controller adds at positions."""
+        return self._add(px, py)
+
+
 def require_known(error_map: ErrorMap) -> None:
     """Raise InputError if a site is unknown: a table has no holes."""
     missing = int((~error_map.valid).sum())
@@ -143,16 +162,38 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
         If the former table is too steep to be one of this stage.
     """
     plate = error_map.artifact
-    cx, cy = active(*frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy))
-    step_m = frame.unit_m * max(float(np.abs(np.diff(c, axis=axis)).max())
-                                for c in (cx, cy) for axis in (0, 1))
-    if step_m > plate.grid_pitch_m / 4:
-        raise InputError(
-            "--onto", f"the active table changes by up to {step_m / M_PER_MM:.3g} mm between "
-            f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart",
-            "is it that of this stage, in this unit? beyond its own field a table may extrapolate")
-    return replace(error_map, gx=error_map.gx + frame.sign_x * cx * frame.unit_m,
-                   gy=error_map.gy + frame.sign_y * cy * frame.unit_m)
+    px, py = frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy)
+    cx, cy = active(px, py)
+    added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
+    own = np.stack([error_map.gx, error_map.gy])
+    limit_m = plate.grid_pitch_m / 4
+    step_m = _steepest(added)
+    if step_m > limit_m or _steepest(own + added) > limit_m >= _steepest(own):
+        raise _misfit(active, (px, py), f"changes by up to {step_m / M_PER_MM:.3g} mm between "
+                      f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart", frame.unit)
+    gx, gy = own + added
+    return replace(error_map, gx=gx, gy=gy)
+
+
+def _steepest(fields: np.ndarray) -> float:
+    """Return the largest step between neighbouring sites of fields (2, nx, ny)."""
+    return max(float(np.nanmax(np.abs(np.diff(fields, axis=axis)))) for axis in (1, 2))
+
+
+def _misfit(active: Correction, at: tuple[np.ndarray, np.ndarray], what: str,
+            unit: str) -> InputError:
+    """Return the refusal of an active table that is too steep at positions of the controller."""
+    spans = [(float(np.nanmin(p)), float(np.nanmax(p))) for p in at]
+    if isinstance(active, Covering) and any(
+            max(low - first, last - high) > (last - first) / 4
+            for (low, high), (first, last) in zip(active.field, spans, strict=True)):
+        table, stage = ("x from {:.4g} to {:.4g}, y from {:.4g} to {:.4g}".format(*x, *y)
+                        for x, y in (active.field, spans))
+        return InputError("--onto", f"the active table covers only part of the field: {table} "
+                          f"{unit}, the map {stage}; beyond it the table {what}",
+                          "name the table of this stage, in this unit (--unit)")
+    return InputError("--onto", f"the active table {what}",
+                      "is it that of this stage, in this unit?")
 
 
 def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.compensation.residual import Correction
+from selfcal_ros.compensation.residual import Correction, Covering
 from selfcal_ros.controllers.grid import (
     MAX_ENTRIES,
     NUMBER,
@@ -81,7 +81,10 @@ def read_kmotion(sources: Sequence[Source], wiring: Wiring) -> Correction:
             out[int(column), int(row)] = value
     grids = [Grid((first[0], first[1]), (step[0], step[1]),
                   filled(out, (columns, rows), source.where), "extrapolate") for out in entries]
-    return lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py)
+    along_x, along_y = ((start, start + by * (count - 1)) for start, by, count in zip(
+        first, step, (columns, rows), strict=True))
+    return Covering(lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py),
+                    along_x, along_y)
 
 
 def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:

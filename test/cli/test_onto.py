@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``--onto``: the table that replaces an active one, on a machine that reads the text itself."""
+"""``--onto``: the table that replaces an active one, on machines that read the text themselves."""
 
 import re
 from dataclasses import replace
@@ -12,73 +12,11 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_json
+from test.support.machines import READERS, Machine, cal
 from test.support.maps import random_map, result_of
 
 PLATE = Artifact(5, 0.01, 0, 7)
 G = random_map(PLATE, 8, gain=20.0)
-
-
-class Table:
-    """A .cal file with one 2D table, read by hand: mm, and um for the corrections."""
-
-    def __init__(self, text: str) -> None:
-        lines = [line for line in text.splitlines() if line and line[0] not in ";"]
-        row, column, *outputs, down, across, width = lines[0].split()[1:]
-        offset = {m[1]: float(m[2]) for line in lines
-                  if (m := re.fullmatch(r":START2D OFFSET(ROW|COL)=(\S+)", line))}
-        assert ":START2D POSUNIT=PRIMARY" in lines and ":START2D CORUNIT=PRIMARY/1000" in lines
-        values = np.array([line.split() for line in lines if line[0] != ":"], dtype=float)
-        assert values.shape[1] == 2 * int(width)
-        self.axes, self.outputs = (int(column), int(row)), tuple(map(int, outputs))
-        self.x = float(across) * np.arange(int(width)) - offset["COL"]
-        self.y = float(down) * np.arange(len(values)) - offset["ROW"]
-        self.values = values.reshape(len(values), -1, 2) * 1e-3
-
-    def at(self, px: float, py: float) -> np.ndarray:
-        """Return what is added to the commands of both axes, mm; nothing at home."""
-        return self._sum(px, py) - self._sum(0.0, 0.0)
-
-    def _sum(self, px, py):
-        hats = [np.interp(p, *(a[::s] for a, s in ((nodes, s), (unit, s))))
-                for nodes, p in ((self.y, py), (self.x, px))
-                for s in [1 if nodes[1] > nodes[0] else -1]
-                for unit in np.eye(len(nodes))]
-        down, across = np.array(hats[:len(self.y)]), np.array(hats[len(self.y):])
-        return np.einsum("r,c,rck->k", down, across, self.values)
-
-
-class Machine:
-    """A stage with the error G, and a controller whose x and y have these homes and directions."""
-
-    def __init__(self, home=(0.0, 0.0), sign=(1, 1)):
-        self.home, self.sign = np.array(home), np.array(sign)
-        self.nodes = [half * np.linspace(-1, 1, n) for half, n in ((0.02, 5), (0.03, 7))]
-
-    def error(self, t):
-        """Return G at a true position, m; nothing at home, so that tables have no bias there."""
-        return self._field(t) - self._field(self.home)
-
-    def _field(self, t):
-        hats = [np.array([np.interp(p, nodes, unit) for unit in np.eye(len(nodes))])
-                for nodes, p in zip(self.nodes, t, strict=True)]
-        return np.array([hats[0] @ g @ hats[1] for g in (G.gx, G.gy)])
-
-    def shown(self, t, table):
-        """Return what the controller shows, m in the stage frame, while the stage is at t."""
-        encoder = self.sign * (np.array(t) + self.error(t) - self.home) * 1e3
-        command = encoder
-        for _ in range(8):
-            command = encoder - table.at(*command)
-        return self.sign * command * 1e-3 + self.home
-
-    def reached(self, t, table, sense=1):
-        """Return where the stage goes when t is commanded, m."""
-        command = self.sign * (np.array(t) - self.home) * 1e3
-        encoder = self.sign * (command + sense * table.at(*command)) * 1e-3 + self.home
-        true = encoder
-        for _ in range(8):
-            true = encoder - self.error(true)
-        return true
 
 
 OLD = """; nodes of its own, some um
@@ -96,39 +34,118 @@ OLD = """; nodes of its own, some um
 """
 
 
-def off(machine, table, sense=1):
-    """Return the residuals at the nodes without their common shift, m, (nodes, 2)."""
-    nodes = [(x, y) for x in machine.nodes[0] for y in machine.nodes[1]]
-    found = np.array([machine.reached(t, table, sense) - t for t in nodes])
-    return found - found.mean(axis=0)
+def machine_of(options, **kwargs):
+    """Return the machine with the error G that is wired as the options say."""
+    given = dict(re.findall(r"--(home-\w|unit) (\S+)", options))
+    unit_m = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254}[given.get("unit", "mm")]
+    nodes = [half * np.linspace(-1, 1, n) for half, n in ((0.02, 5), (0.03, 7))]
+    return Machine(nodes, np.stack([kwargs["emap"].gx, kwargs["emap"].gy]),
+                   [float(given.get(f"home-{axis}", 0)) * unit_m for axis in "xy"],
+                   [-1 if f"--reverse-{axis}" in options else 1 for axis in "xy"], unit_m)
 
 
-@pytest.mark.parametrize(("options", "machine"), [
-    ("", Machine()), ("--home-x -10 --home-y 20", Machine((-10e-3, 20e-3))),
-    ("--reverse-x", Machine(sign=(-1, 1))),
-    ("--reverse-y --home-x 10 --x-axis 3 --y-axis 1", Machine((10e-3, 0), (1, -1)))])
-def test_cal_export_replaces_the_active_table(tmp_path, monkeypatch, capsys, options, machine):
+def measured(machine, table):
+    """Write what a calibration finds while a table is active, without noise."""
+    points = np.stack(np.meshgrid(*machine.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    gx, gy = (machine.shown(points, table) - points).T.reshape(2, *PLATE.shape)
+    write_json("R.json", result_to_dict(result_of(replace(G, gx=gx, gy=gy))))
+
+
+@pytest.mark.parametrize("options", [
+    "", "--home-x -10 --home-y 20", "--reverse-x", "--reverse-y --home-x 10 --x-axis 3 --y-axis 1"])
+def test_cal_export_replaces_the_active_table(tmp_path, monkeypatch, capsys, options):
     """Noise-free: what is left at the nodes is the rounding of 0.01 nm, of x, y and home."""
     monkeypatch.chdir(tmp_path)
     column, row = (3, 1) if "axis" in options else (1, 2)
-    text = OLD.format(row=row, column=column)
+    text, machine = OLD.format(row=row, column=column), machine_of(options, emap=G)
     Path("old.cal").write_text(text)
-    old, seen = Table(text), np.empty((2, *PLATE.shape))
-    for i, x in enumerate(machine.nodes[0]):
-        for j, y in enumerate(machine.nodes[1]):
-            seen[:, i, j] = machine.shown((x, y), old) - (x, y)
-    write_json("R.json", result_to_dict(result_of(replace(G, gx=seen[0], gy=seen[1]))))
+    old = cal([text], None)
+    measured(machine, old)
     words = f"R.json -o new.cal --onto old.cal {options}".split()
     assert main(["cal", "export", *words]) == 0
     assert "bends between the nodes" in capsys.readouterr().err
-    new = Table(Path("new.cal").read_text())
-    assert new.axes == new.outputs == (column, row)
-    assert np.abs(off(machine, old)).max() > 1e-6  # the stage as it was calibrated
-    assert np.abs(off(machine, new)).max() < 2e-11
-    assert np.abs(off(machine, new, sense=-1)).max() > 1e-6
+    text = Path("new.cal").read_text()
+    new = cal([text], None)
+    assert f":START2D {row} {column} {column} {row} " in text
+    assert machine.off(old) > 1e-6  # the stage as it was calibrated
+    assert machine.off(new) < 2e-11
+    assert machine.off(new, sense=-1) > 1e-6
     wrong = "--reverse-y" if "--reverse-y" not in options else "--home-y 1"
     assert main(["cal", "export", *words, *wrong.split(), "--force"]) == 0
-    assert np.abs(off(machine, Table(Path("new.cal").read_text()))).max() > 1e-7
+    assert machine.off(cal([Path("new.cal").read_text()], None)) > 1e-7
+
+
+def sayable(name, emap):
+    """Return the part of a map that a format can hold."""
+    gx, gy = emap.gx, emap.gy
+    if name == "siemens":
+        gx, gy = (g[:, :1] + g[:1] - g[0, 0] for g in (gx, gy))
+    if name == "linuxcnc":
+        gx, gy = gx[:, :1] + 0 * gx, gy[:1] + 0 * gy
+    return replace(emap, gx=gx, gy=gy)
+
+
+WIRED = ["", "--home-x {-10} --home-y {20} --reverse-x", "--reverse-y --home-x {10}",
+         "--home-x {5} --reverse-x --reverse-y", "--x-axis 3 --y-axis 1 --home-y {-15}"]
+"""Lengths in braces are mm."""
+ACTIVE = {"of the same nodes": (Artifact(5, 0.01, 0, 7), ""),
+          "of a finer pitch": (Artifact(13, 0.005, 0, 17), ""),
+          "of a wider field": (Artifact(5, 0.0175, 0, 7), ""),
+          "of a part of the field": (Artifact(3, 0.0125, 0, 5), ""),
+          "of another origin": (Artifact(7, 0.01, 0, 9), "--home-x {2} --home-y {-3.5}")}
+
+
+PAIRS = [(w, a) for w in range(len(WIRED)) for a, _ in enumerate(ACTIVE) if (w + 2 * a) % 5 < 2]
+"""Each wiring with two of the tables, each table with two of the wirings."""
+
+
+def options_of(text, unit):
+    """Return options with their lengths in a unit."""
+    per = {"m": 1e3, "mm": 1.0, "um": 1e-3, "in": 25.4}[unit]
+    return re.sub(r"\{(\S+)\}", lambda m: f"{float(m[1]) / per:.15g}", text)
+
+
+@pytest.mark.parametrize(("wired", "active"), PAIRS)
+@pytest.mark.parametrize("name", READERS)
+def test_a_replaced_table_leaves_the_rounding_of_its_digits(tmp_path, monkeypatch, capsys, name,
+                                                            wired, active):
+    """Measured with a table active, whatever its nodes; at the nodes of the map and between."""
+    monkeypatch.chdir(tmp_path)
+    units = ["mm", "um", "m", *(["in"] if name != "cal" else [])]
+    unit = units[(wired + active) % len(units)]
+    plate, *texts = [*ACTIVE.values()][active][0], WIRED[wired], [*ACTIVE.values()][active][1]
+    options, moved = (options_of(text, unit) for text in texts)
+    options += f" --unit {unit}"
+    machine = machine_of(options, emap=sayable(name, G))
+    counts = [2e6 * machine.unit_m / 1e-3] * 2
+    if name == "pmac":
+        options += "".join(f" --counts-per-unit {axis}={counts[0]!r}" for axis in (
+            (3, 1) if "axis" in options else (1, 2)))
+    subtract = {"subtract": True} if name in ("beckhoff", "siemens") and wired % 2 else {}
+    more = [*options.split(), *(["--negate"] if subtract else [])]
+    verb = ["cal", "export"] if name == "cal" else ["export", name]
+
+    def machine_s(file):
+        files = sorted(Path().glob(f"{file}*.txt"))
+        unit = {"unit_m": machine.unit_m} if name == "beckhoff" else {}
+        return [str(path) for path in files], READERS[name](
+            [path.read_text() for path in files], counts, **unit, **subtract)
+
+    write_json("Old.json", result_to_dict(result_of(sayable(name, random_map(plate, 5, gain=20)))))
+    assert main([*verb, "Old.json", "-o", "old.txt", *more, *moved.split()]) == 0
+    files, old = machine_s("old")
+    measured(machine, old)
+    before = machine.off(old)
+    assert before > 1e-6
+    assert main([*verb, "R.json", "-o", "new.txt", "--onto", *files, *more]) == 0
+    _, new = machine_s("new")
+    bound = 8e-11 if name == "pmac" else 3e-11
+    assert machine.off(new) < bound
+    assert machine.off(new, between=True) < bound
+    assert machine.off(new, sense=-1) > 1e-6
+    assert main([*verb, "R.json", "-o", "alone.txt", *more]) == 0
+    assert machine.off(machine_s("alone")[1]) > 1e-6  # what the old one corrected is lost
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize("verb", [["export", "kmotion"], ["cal", "export"]])
@@ -145,8 +162,12 @@ def test_a_table_that_does_not_fit_is_refused_as_such(tmp_path, monkeypatch, cap
     capsys.readouterr()
     assert main([*verb, "R.json", "-o", "new", "--onto", "small",
                  *(["--unit", "mm"] if "kmotion" in verb else [])]) == 2
+    where = ("the active table covers only part of the field: x from -0.02 to 0.02, y from "
+             "-0.02 to 0.02 mm, the map x from -20 to 20, y from -20 to 20; beyond it the table "
+             if "kmotion" in verb else "the active table ")
+    mend = ("name the table of this stage, in this unit (--unit)" if "kmotion" in verb
+            else "is it that of this stage, in this unit?")
     assert re.fullmatch(
-        r"selfcal (cal|export): --onto: the active table changes by up to [\d.e+]+ mm between "
-        r"neighbouring sites 10 mm apart; is it that of this stage, in this unit\? beyond its own "
-        r"field a table may extrapolate\n", capsys.readouterr().err)
+        rf"selfcal (cal|export): --onto: {re.escape(where)}changes by up to [\d.e+]+ mm between "
+        rf"neighbouring sites 10 mm apart; {re.escape(mend)}\n", capsys.readouterr().err)
     assert not Path("new").exists()
