@@ -112,15 +112,19 @@ def as_answer(error: Exception) -> tuple[ExitCode, str]:
 
 
 def printable(text: object) -> str:
-    r"""Return `text` as one line without control characters.
-
-    Names in bags, plans and messages come from outside: an escape sequence, a line break or a
-    change of the writing direction in them is shown as ``\x1b``, ``\n``, ``\u202e``. A text that
-    is too long is shortened to its beginning, length and end.
-    """
+    """Return `text` as `visible`; one that is too long as its beginning, length and end."""
     text = str(text)
     if len(text) > sum(SHOWN):
         text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"
+    return visible(text)
+
+
+def visible(text: str) -> str:
+    r"""Return `text` as one line without control characters.
+
+    Names in bags, plans and messages come from outside: an escape sequence, a line break or a
+    change of the writing direction in them is shown as ``\x1b``, ``\n``, ``\u202e``.
+    """
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()

@@ -8,8 +8,9 @@ from selfcal_ros.cli.trace import deliver, outputs_of
 from selfcal_ros.files import read_yaml
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
-from selfcal_ros.standards.dcc import certificate, is_traceable
+from selfcal_ros.standards.dcc import certificate
 from selfcal_ros.standards.details import details_from_dict
+from selfcal_ros.standards.statements import is_traceable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -175,8 +175,9 @@ def convention_section(result: CalibrationResult) -> Section:
     """Return the conventions behind the numbers: signs, datum, sense of measurement, coverage."""
     facts = [
         ("error", "G = indicated − true, stage frame; add +G to a command to reach its position"),
-        ("XY datum", "no translation, rotation or magnification over the field (Hu eq. 5), "
-                     "unless a reference length sets the scale"),
+        ("XY datum", "no translation or rotation over the field; a reference length sets the scale"
+         if result.reference else
+         "no translation, rotation or magnification over the field (Hu eq. 5)"),
         ("O and R", "Gx = O·y + R·x + Fx, Gy = O·x − R·y + Fy (Hu eq. 6)")]
     if result.artifact.angular_count:
         facts.append(("θ datum", _THETA_DATUM[result.error_map.datum_theta]))
@@ -189,7 +190,7 @@ def convention_section(result: CalibrationResult) -> Section:
     return Section("Conventions", tuple(facts))
 
 
-def _said(value: Any) -> str:
+def said(value: Any) -> str:
     """Return a value as text; the entries of a mapping are listed."""
     if isinstance(value, Mapping):
         return ", ".join(f"{printable(key)}: {printable(item)}" for key, item in value.items())
@@ -206,7 +207,7 @@ def provenance_section(result: CalibrationResult) -> Section:
                                                              printable(result.method))),
               ("result schema", SCHEMA), ("software", f"selfcal_ros {__version__}")]
     made = result.provenance
-    facts += [(_words(key), _said(value)) for key, value in (
+    facts += [(_words(key), said(value)) for key, value in (
         ("created", made.created), ("solved_by", made.version and f"selfcal_ros {made.version}"),
         ("run", result.run_id), *made.extra.items()) if value]
     if math.isfinite(made.duration_s):

@@ -4,11 +4,15 @@
 from typing import Any
 
 from selfcal_ros.apply import StageMap
-from selfcal_ros.errors import InputError, printable
+from selfcal_ros.errors import InputError, printable, visible
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter
 from selfcal_ros.reporting.summary.sections import Section
-from selfcal_ros.standards.dcc import distance_text, scale_texts
+from selfcal_ros.standards.statements import (
+    distance_text,
+    require_certifiable,
+    statement_texts,
+)
 
 
 def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> Chapter:
@@ -20,7 +24,13 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
         A calibration that identifies the stage.
     details : dict
         As `selfcal_ros.standards.details.details_from_dict` gives it.
+
+    Raises
+    ------
+    InputError
+        As `require_certifiable`.
     """
+    require_certifiable(result, details)
     sections = [_facts(title, details[name]) for title, name in (
         ("Certificate", "certificate"), ("Laboratory", "laboratory"), ("Customer", "customer"),
         ("Item", "item"))]
@@ -33,9 +43,10 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
     except InputError as error:
         distance = f"the correlations between nodes are not known ({printable(error.what)})"
     sections += [
-        Section("Metrological traceability", notes=tuple(map(printable, scale_texts(result)))),
+        *(Section(name, notes=tuple(map(visible, texts)))
+          for name, texts in statement_texts(result)),
         Section("Uncertainty of distances", notes=(distance,)),
-        Section("Remarks", notes=tuple(printable(item["text"]) for item in details["remarks"]))]
+        Section("Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"]))]
     return Chapter("Certificate", sections=tuple(sections))
 
 

@@ -2,7 +2,6 @@
 """A digital calibration certificate: DCC 3.3.0 of the PTB with quantities in D-SI 2.2.1."""
 
 from collections.abc import Iterator, Sequence
-from datetime import date
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -10,25 +9,32 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.apply import StageMap
-from selfcal_ros.errors import InputError, printable
+from selfcal_ros.errors import InputError, printable, visible
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.result import PRIOR, CalibrationResult
-from selfcal_ros.model.verdict import reference_name
-from selfcal_ros.reporting.chapters import convention_section
+from selfcal_ros.model.result import COMBINED, CalibrationResult
+from selfcal_ros.reporting.chapters import convention_section, said
 from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
 from selfcal_ros.standards.details import UNITS
-from selfcal_ros.units import UM_PER_M
+from selfcal_ros.standards.statements import (
+    AGREEMENT,
+    TRACEABILITY,
+    distance_text,
+    is_traceable,
+    require_certifiable,
+    statement_texts,
+)
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 VERSION = "3.3.0"
 PROBABILITY = "0.9545"
 MAX_COVARIANCE = 21 * 21
 """Largest number of nodes whose covariance is written: 10 MB."""
+TEXTS_ARE_IN = "en"
+"""Language of what the program states; names and remarks are in that of the laboratory."""
 METRE, RADIAN, ONE = r"\metre", r"\radian", r"\one"
-INVALID = "No statement of the uncertainty is valid: the readings contradict the model."
 
 
 def certificate(result: CalibrationResult, details: dict[str, Any], *, covariance: bool = False,
@@ -54,16 +60,11 @@ def certificate(result: CalibrationResult, details: dict[str, Any], *, covarianc
         If the result is not qualified and `not_qualified` is False, or has no uncertainties.
     """
     stage = StageMap(result)
-    if not result.has_uncertainty:
-        raise InputError("certificate", "the result has no uncertainties",
-                         "solve again with --uncertainty always")
+    require_certifiable(result, details)
     if not result.verdict.qualified and not not_qualified:
         raise InputError("certificate", "the result is not qualified: "
                          f"{printable(result.verdict.sentence)}",
                          "calibrate again, or let the certificate state it with --not-qualified")
-    if PRIOR in result.extra:
-        raise InputError("certificate", "a prior is part of the map: its uncertainty is not that "
-                         "of readings alone", "solve without a prior")
     for prefix, uri in (("dcc", DCC), ("si", SI)):
         ET.register_namespace(prefix, uri)
     root = _dcc("digitalCalibrationCertificate", _administration(result, details),
@@ -78,7 +79,7 @@ def _node(namespace: str, name: str, *content: ET.Element | str | None) -> ET.El
     found = ET.Element(f"{{{namespace}}}{name}")
     for part in content:
         if isinstance(part, str):
-            found.text = printable(part)
+            found.text = visible(part)
         elif part is not None:
             found.append(part)
     return found
@@ -101,13 +102,6 @@ def _content(name: str, *texts: str) -> ET.Element:
     return _dcc(name, *(_dcc("content", text) for text in texts))
 
 
-def is_traceable(result: CalibrationResult) -> bool:
-    """Return whether a certified length, at the temperature of the measurement, sets the scale."""
-    reference = result.reference or {}
-    return bool(reference.get("certificate") and reference.get("certified")
-                and reference.get("u_relative"))
-
-
 def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.Element:
     core, item, lab = details["certificate"], details["item"], details["laboratory"]
     order = core.get("order")
@@ -118,14 +112,15 @@ def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.El
         "administrativeData",
         _dcc("dccSoftware", _software()),
         _dcc("coreData", _dcc("countryCodeISO3166_1", core["country"]),
-             _dcc("usedLangCodeISO639_1", core["language"]),
-             _dcc("mandatoryLangCodeISO639_1", core["language"]),
+             *(_dcc("usedLangCodeISO639_1", code) for code in dict.fromkeys(
+                 (core["language"], TEXTS_ARE_IN))),
+             _dcc("mandatoryLangCodeISO639_1", TEXTS_ARE_IN),
              _dcc("uniqueIdentifier", core["id"]),
              _dcc("identifications", _identification("calibrationLaboratory", order, "order"))
              if order else None,
              _dcc("beginPerformanceDate", core["begin"]), _dcc("endPerformanceDate", core["end"]),
              _dcc("performanceLocation", core["place"]),
-             _dcc("issueDate", core.get("issued") or date.today().isoformat())),
+             _dcc("issueDate", core["issued"])),
         _dcc("items", _dcc("item", *_thing(item, "manufacturer"))),
         _dcc("calibrationLaboratory", _given("calibrationLaboratoryCode", lab.get("code")),
              _dcc("contact", *_contact(lab))),
@@ -147,8 +142,10 @@ def _identification(issuer: str, value: str, name: str) -> ET.Element:
 def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
     """Yield the parts of an item or an equipment."""
     yield _content("name", item["name"])
-    if "certificate" in item:
-        yield _content("description", f"certificate: {item['certificate']}")
+    known = [f"{word}: {item[key]}" for word, key in (
+        ("certificate", "certificate"), ("valid until", "valid_until")) if key in item]
+    if known:
+        yield _content("description", ", ".join(known))
     if "manufacturer" in item:
         yield _dcc("manufacturer", _content("name", item["manufacturer"]))
     yield _given("model", item.get("model"))
@@ -167,44 +164,20 @@ def _contact(of: dict[str, str]) -> Iterator[ET.Element | None]:
 
 
 def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[ET.Element]:
-    """Yield the statements on traceability, on the verdict, and the remarks."""
-    traceable = is_traceable(result)
-    yield _dcc("statement", _content("name", "Metrological traceability"),
-               _dcc("traceable", str(traceable).lower()),
-               _content("declaration", *scale_texts(result)))
-    verdict = result.verdict
-    texts = [verdict.sentence or str(verdict.grade), *verdict.reasons]
-    yield _dcc("statement", _content("name", "Agreement of readings and model"),
-               _content("declaration", *texts, *([] if verdict.qualified else [INVALID])),
-               _dcc("valid", str(verdict.qualified).lower()))
+    """Yield the statements on traceability, verdict, uncertainty and scope, and the remarks."""
+    flags = {TRACEABILITY: ("traceable", is_traceable(result)),
+             AGREEMENT: ("valid", result.verdict.qualified)}
+    for name, texts in statement_texts(result):
+        key, value = flags.get(name, ("", False))
+        flag = _dcc(key, str(value).lower()) if key else None
+        yield _dcc("statement", _content("name", name), flag if key == "traceable" else None,
+                   _content("declaration", *texts), flag if key == "valid" else None)
     for remark in details["remarks"]:
         yield _dcc("statement", _content("name", "Remark"), _content("declaration", remark["text"]))
 
 
-def scale_texts(result: CalibrationResult) -> list[str]:
-    """Return what sets the scale of a map, and whether it is traceable."""
-    reference = result.reference
-    if not reference:
-        return ["The scale of the map is a convention, relative to the encoders: no reference "
-                "length was used. Form, straightness and squareness do not depend on a reference."]
-    texts = [f"The scale is set by a reference length ({reference_name(reference)}): relative "
-             f"error {reference['relative_error']:.4g}, standard uncertainty "
-             f"{reference['u_relative']:.3g}; certificate: "
-             f"{reference.get('certificate') or 'none'}."]
-    if known := reference.get("certified"):
-        texts.append(
-            f"Certified at {known['certified_at_c']:g} °C: {known['relative_error']:.4g}, standard "
-            f"uncertainty {known['u_relative']:.3g}; used at {known['temperature_c']:g} °C "
-            f"(u {known['u_temperature_k']:g} K) with the expansion coefficient "
-            f"{known['expansion_per_k']:.4g} 1/K (u {known['u_expansion_per_k']:.2g} 1/K).")
-    if not is_traceable(result):
-        texts.append("Not traceable: this needs a certificate, its uncertainty, and the "
-                     "temperature of the reference (--certificate, --reference-at).")
-    return texts
-
-
 def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> ET.Element:
-    result = stage.result
+    result, core = stage.result, details["certificate"]
     conditions = [_dcc("influenceCondition", _content("name", item["name"]),
                        _dcc("data", _condition(item))) for item in details["conditions"]]
     equipment = [_dcc("measuringEquipment", *_thing(item, "manufacturer"))
@@ -225,7 +198,7 @@ def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> E
                   *_correlations(stage, covariance=covariance)),
              _dcc("measurementMetaData", *(_dcc("metaData", _content("name", name),
                                                 _content("description", text))
-                                           for name, text in _meta(result)))))
+                                           for name, text in _meta(result, core)))))
 
 
 def _model_texts(result: CalibrationResult) -> list[str]:
@@ -238,7 +211,7 @@ def _model_texts(result: CalibrationResult) -> list[str]:
     return texts
 
 
-def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
+def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what else is known of the measurement, by name."""
     noise, made = result.noise, result.provenance
     yield "plan", result.plan_id
@@ -247,17 +220,17 @@ def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
             yield f"readings, {name}", result.input[name]
     for name, value in zip(("file", "sha256"), result.read_from or (), strict=False):
         yield f"result, {name}", value
-    for name, value in (("run", result.run_id), ("evaluated", made.created), *made.extra.items()):
+    for name, value in (("run", result.run_id), ("evaluated", made.created), *made.extra.items(),
+                        ("clock of the readings", core.get("clock"))):
         if value:
-            yield name.replace("_", " "), str(value)
+            yield name.replace("_", " "), said(value)
     if np.isfinite(made.duration_s):
         yield "duration", f"{made.duration_s:.0f} s"
-    for view in result.views:
-        name = without_cell(view.name)
-        cell = view.name.removeprefix(name)
-        yield f"view {name}, cell {cell}" if cell else f"view {name}", (
-            f"turned {np.degrees(view.rotation):.6g}°, shifted ({view.translation_x:.6g}, "
-            f"{view.translation_y:.6g}) m, {view.used} readings, {view.rejected} rejected")
+    for run in result.extra.get(COMBINED, {}).get("runs", ()):
+        yield f"readings of {run['file']}", (
+            f"run {run['run_id'] or 'unknown'}, sha256 {run['sha256'] or 'unknown'}, weight "
+            f"{run['weight']:.3g}")
+    yield from _views(result)
     for kind, name in (("xy", "x and y"), ("theta", "theta")):
         if np.isfinite(k := getattr(noise, f"k_{kind}")):
             yield f"coverage of {name}", (f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))}"
@@ -268,6 +241,16 @@ def _meta(result: CalibrationResult) -> Iterator[tuple[str, str]]:
         yield "warning", warning
 
 
+def _views(result: CalibrationResult) -> Iterator[tuple[str, str]]:
+    """Yield the name of each view, and its pose and readings."""
+    for view in result.views:
+        name = without_cell(view.name)
+        cell = view.name.removeprefix(name)
+        yield f"view {name}, cell {cell}" if cell else f"view {name}", (
+            f"turned {np.degrees(view.rotation):.6g}°, shifted ({view.translation_x:.6g}, "
+            f"{view.translation_y:.6g}) m, {view.used} readings, {view.rejected} rejected")
+
+
 def _condition(item: dict[str, Any]) -> ET.Element:
     if "text" in item and "value" not in item:
         return _content("text", item["text"])
@@ -275,11 +258,11 @@ def _condition(item: dict[str, Any]) -> ET.Element:
                 _real(item["value"], UNITS[item["unit"]], item.get("u")))
 
 
-def _real(value: float, unit: str, u: float | None = None) -> ET.Element:
-    """Return a number with its unit, and U = 2 u if u is known."""
+def _real(value: float, unit: str, u: float | None = None, k: float = 2.0) -> ET.Element:
+    """Return a number with its unit, and U = k u if u is known."""
     return _si("real", _si("value", _number(value)), _si("unit", unit), _si(
         "measurementUncertaintyUnivariate", _si(
-            "expandedMU", _si("valueExpandedMU", _number(2 * u)), _si("coverageFactor", "2"),
+            "expandedMU", _si("valueExpandedMU", _number(k * u)), _si("coverageFactor", f"{k:.5g}"),
             _si("coverageProbability", PROBABILITY))) if u is not None else None)
 
 
@@ -314,10 +297,11 @@ def _maps(stage: StageMap) -> Iterator[ET.Element]:
         _list("Gx", emap.gx[known], METRE, (emap.u_gx[known], k)),
         _list("Gy", emap.gy[known], METRE, (emap.u_gy[known], k))))
     u_o, u_r = (u if np.isfinite(u) else None for u in first_order_u(result))
-    yield _result("Squareness and difference of scales", _dcc(
-        "list", _scalar("non-orthogonality O, Gx = O y + R x, Gy = O x - R y",
-                        emap.nonorthogonality, RADIAN, u=u_o),
-        _scalar("scale difference R", emap.scale_difference, ONE, u=u_r)))
+    if np.isfinite(emap.nonorthogonality + emap.scale_difference):
+        yield _result("Squareness and difference of scales", _dcc(
+            "list", _scalar("non-orthogonality O, Gx = O y + R x, Gy = O x - R y",
+                            emap.nonorthogonality, RADIAN, u=u_o, k=k),
+            _scalar("scale difference R", emap.scale_difference, ONE, u=u_r, k=k)))
     lines = np.isfinite(emap.g_theta + emap.u_g_theta)
     if lines.any():
         angle = 2 * np.pi * np.flatnonzero(lines) / at.angular_count
@@ -332,9 +316,9 @@ def _result(name: str, *data: ET.Element) -> ET.Element:
 
 
 def _scalar(name: str, value: float, unit: str, text: str = "", *,
-            u: float | None = None) -> ET.Element:
+            u: float | None = None, k: float = 2.0) -> ET.Element:
     return _dcc("quantity", _content("name", name), _content("description", text) if text else None,
-                _real(value, unit, u))
+                _real(value, unit, u, k))
 
 
 def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
@@ -344,24 +328,13 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
         rows = [_scalar(f"{line.component} (type {line.kind})", line.effect_rms, unit,
                         f"largest {line.effect_max:.3g}, {dof_text(line.dof)} degrees of freedom, "
                         f"{line.source}: {line.text or line_text(line)}") for line in budget.lines]
+        most = "at most " if budget.anywhere else ""
         rows.append(_scalar("combined standard uncertainty", budget.u_rms, unit,
-                            f"largest {budget.u_max:.3g}, {dof_text(budget.dof)} degrees of "
+                            f"largest {most}{budget.u_max:.3g}, {dof_text(budget.dof)} degrees of "
                             "freedom"))
         rows.append(_scalar("expanded uncertainty", budget.U_rms, unit,
-                            f"k = {budget.k:.3g} for 95.45 %, largest {budget.U_max:.3g}"))
+                            f"k = {budget.k:.3g} for 95.45 %, largest {most}{budget.U_max:.3g}"))
         yield _result(f"Uncertainty budget: {quantity_text(budget)}", _dcc("list", *rows))
-
-
-def distance_text(stage: StageMap, a: float, b: float) -> str:
-    """Return the statement U = a + b L on distances in the field, a in m and b in m/m."""
-    nodes = ""
-    if stage.halfway.any():
-        a_nodes, b_nodes = stage.length_uncertainty(anywhere=False)
-        nodes = (f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "
-                 f"· L, without the {stage.method} interpolation between nodes")
-    return (f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
-            f"+ {b * UM_PER_M:.3g} µm/m · L{nodes}; k = {stage.result.noise.k_xy:.3g}, 95.45 %. "
-            "Errors of neighbouring nodes are correlated.")
 
 
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
@@ -395,5 +368,20 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
                     "measurementUncertaintyMultivariateXMLList", _si(
                         "ellipsoidalRegionMUXMLList",
                         _si("covarianceMatrixXMLList", *columns),
-                        _si("coverageFactorXMLList", f"{stage.result.noise.k_xy:.4f}"),
+                        _si("coverageFactorXMLList", f"{_of_ellipsoid(stage, full):.4f}"),
                         _si("coverageProbabilityXMLList", PROBABILITY))))))
+
+
+def _of_ellipsoid(stage: StageMap, covariance: np.ndarray) -> float:
+    """Return the coverage factor of the ellipsoid of all nodes together (JCGM 102:2011, 6.5.2).
+
+    The datum leaves the covariance less than its full rank.
+    """
+    from scipy.stats import chi2, f  # half a second, for this alone
+
+    rank = int(np.linalg.matrix_rank(covariance, tol=1e-7 * np.abs(covariance).max(),
+                                     hermitian=True))
+    dof = stage.result.noise.dof_of("xy")
+    square = rank * f.ppf(float(PROBABILITY), rank, dof) if np.isfinite(dof) else chi2.ppf(
+        float(PROBABILITY), rank)
+    return float(np.sqrt(square))

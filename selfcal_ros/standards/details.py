@@ -56,7 +56,7 @@ _THING: dict[str, Kind] = {
 SECTIONS: dict[str, tuple[dict[str, Kind], tuple[str, ...]]] = {
     "certificate": ({"id": TEXT, "country": COUNTRY, "language": LANGUAGE,
                      "place": (_choice(*PLACES), "one of " + ", ".join(PLACES)), "begin": DATE,
-                     "end": DATE, "issued": DATE, "order": TEXT},
+                     "end": DATE, "issued": DATE, "order": TEXT, "clock": TEXT},
                     ("id", "country", "language", "place", "begin", "end")),
     "laboratory": ({**_ADDRESS, "code": TEXT}, ("name", "city", "country")),
     "customer": (_ADDRESS, ("name", "city", "country")),
@@ -64,7 +64,7 @@ SECTIONS: dict[str, tuple[dict[str, Kind], tuple[str, ...]]] = {
     "persons": ({"name": TEXT, "role": TEXT}, ("name",)),
     "conditions": ({"name": TEXT, "value": NUMBER, "u": NUMBER, "unit": (_choice(*UNITS), "one of "
                     + ", ".join(UNITS)), "text": TEXT}, ("name",)),
-    "equipment": (_THING, ("name",)),
+    "equipment": ({**_THING, "valid_until": DATE}, ("name",)),
     "remarks": ({"text": TEXT}, ("text",))}
 """Section -> its keys, and those that must be there."""
 LISTS = ("persons", "conditions", "equipment", "remarks")
@@ -114,11 +114,25 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
                              "text", "give value, u and unit, or text")
         if item.get("unit") == "degC":
             check_celsius(item["value"], f"{where}: conditions[{index}]")
+    _check_dates(found, where)
+    return found
+
+
+def _check_dates(found: dict[str, Any], where: str) -> None:
+    """Refuse dates that are not in their order; the day of issue is today unless it is given."""
     core = found["certificate"]
     if core["begin"] > core["end"]:
         raise InputError(f"{where}: certificate.end", f"{core['end']} is before {core['begin']}",
                          "exchange begin and end")
-    return found
+    issued = core.setdefault("issued", date.today().isoformat())
+    if issued < core["end"]:
+        raise InputError(f"{where}: certificate.issued", f"{issued} is before the end of the "
+                         f"measurement, {core['end']}", "correct the dates")
+    for index, item in enumerate(found["equipment"]):
+        if item.get("valid_until", issued) < core["end"]:
+            raise InputError(f"{where}: equipment[{index}].valid_until", f"{item['valid_until']} "
+                             f"is before the end of the measurement, {core['end']}",
+                             "measure with equipment whose certificate is valid")
 
 
 def _section(data: Any, name: str, where: str) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 """`selfcal certificate`: the schema's structure, the map's numbers, what is refused."""
 
 import os
+import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -14,17 +16,20 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.result import PRIOR, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.standards.chapter import certificate_chapter
-from selfcal_ros.standards.dcc import DCC, SI, certificate, is_traceable
+from selfcal_ros.standards.dcc import DCC, SI, certificate
 from selfcal_ros.standards.details import details_from_dict
+from selfcal_ros.standards.statements import is_traceable
+from test.support.maps import random_map, result_of
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 DETAILS = Path(__file__).parents[2] / "config/certificates/details.yaml"
@@ -195,6 +200,179 @@ def test_a_result_that_is_not_qualified_needs_the_option():
         written(replace(RESULT, error_map=replace(RESULT.error_map, u_gx=nothing, u_gy=nothing)))
 
 
+def scalar(root, name):
+    """Return value, U and coverage factor of a number."""
+    [item] = [found for found in root.iter(f"{{{DCC}}}quantity")
+              if found.findtext("dcc:name/dcc:content", "", IN).startswith(name)]
+    return [float(item.findtext(f".//si:{key}", "nan", IN))
+            for key in ("value", "valueExpandedMU", "coverageFactor")]
+
+
+def test_squareness_has_the_coverage_factor_of_the_map():
+    few = replace(RESULT, noise=replace(RESULT.noise, k_xy=2.87))
+    for name, value, u in zip(("non-orthogonality O", "scale difference R"), (
+            RESULT.error_map.nonorthogonality, RESULT.error_map.scale_difference),
+            first_order_u(RESULT), strict=True):
+        assert scalar(written(few), name) == pytest.approx([value, 2.87 * u, 2.87], rel=1e-6)
+
+
+@pytest.mark.parametrize("dof", [np.inf, 5.0])
+def test_the_ellipsoid_of_all_nodes_has_the_factor_of_its_dimension(dof):
+    """25 nodes, of two coordinates, without translation, rotation and magnification: 46."""
+    noise = replace(RESULT.noise, dof_xy=dof, dof_map_xy=dof)
+    root = written(replace(RESULT, noise=noise), covariance=True)
+    found = float(root.findtext(".//si:ellipsoidalRegionMUXMLList/si:coverageFactorXMLList", "",
+                                IN))
+    assert found == pytest.approx({np.inf: 7.960, 5.0: 14.636}[dof], abs=1e-3)
+
+
+def test_all_nodes_of_a_large_field_are_written():
+    large = replace(result_of(random_map(Artifact(41, 0.002), 3)), noise=RESULT.noise)
+    xml = certificate(large, details())
+    root = ET.fromstring(xml)
+    assert [len(values(named(root, name)[0])) for name in ("x", "Gx", "Gy")] == [41 * 41] * 3
+    assert len(values(named(root, "Gy")[0], U)) == 41 * 41
+    np.testing.assert_allclose(values(named(root, "Gx")[0]), large.error_map.gx.ravel(), rtol=1e-8)
+    if SCHEMA.exists():
+        etree = pytest.importorskip("lxml.etree")
+        etree.XMLSchema(etree.parse(str(SCHEMA))).assertValid(etree.fromstring(xml))
+
+
+def test_a_long_remark_is_not_shortened_and_a_hostile_one_is_text():
+    data = details()
+    long = "w" * 5000
+    hostile = "]]> <dcc:x/> & \" ' \x1b[2J \u202e \ufffe \U0001f600 --> <!--"
+    data["remarks"] = [{"text": long}, {"text": hostile}]
+    root = ET.fromstring(certificate(RESULT, data))
+    said = [" ".join(item.itertext()) for item in named(root, "Remark")]
+    assert long in said[0]
+    assert "]]> <dcc:x/> & \" ' \\x1b[2J \\u202e \\ufffe \U0001f600 --> <!--" in said[1]
+    assert any(long in note for section in certificate_chapter(RESULT, data).sections
+               for note in section.notes)
+
+
+def test_the_datum_is_that_of_the_result():
+    with_length = solved(CERTIFIED)
+    for result, scale in ((RESULT, "no translation, rotation or magnification over the field"),
+                          (with_length, "no translation or rotation over the field; a reference "
+                           "length sets the scale")):
+        [about] = named(written(result), "Error map of the stage")
+        text = " ".join(about.find("dcc:description", IN).itertext())
+        assert f"XY datum: {scale}" in text and "unless" not in text
+
+
+def exposed(first, last):
+    made = replace(RESULT.provenance, extra={
+        "first_exposure": f"{first}T23:30:00.000+00:00", "last_exposure": f"{last}T01:00:00+00:00",
+        "visit_order": {"identity": "x_back_y_back"}})
+    return replace(RESULT, provenance=made)
+
+
+@pytest.mark.parametrize(("first", "last", "good"), [
+    ("2026-11-21", "2026-11-21", True), ("2026-11-20", "2026-11-22", True),  # a time zone apart
+    ("2026-11-19", "2026-11-21", False), ("2026-11-21", "2026-11-23", False),
+    ("2023-11-14", "2023-11-14", False)])
+def test_readings_of_other_days_are_refused(first, last, good):
+    result, clock = exposed(first, last), {**details()}
+    clock["certificate"] = {**clock["certificate"], "clock": "was not set: 3 years behind"}
+    if not good:
+        for write in (certificate, certificate_chapter):
+            with pytest.raises(InputError, match=f"the readings are of {first} to {last}, the "
+                               "dates of performance 2026-11-21 to 2026-11-21; correct begin"):
+                write(result, details())
+    else:
+        [order] = named(written(result), "visit order")
+        assert order.findtext("dcc:description/dcc:content", "", IN) == "identity: x_back_y_back"
+    [said] = named(ET.fromstring(certificate(result, clock)), "clock of the readings")
+    assert "3 years behind" in " ".join(said.itertext())
+
+
+def test_a_date_of_issue_that_is_missing_is_today_and_not_before_the_end():
+    given = without("certificate", "issued")
+    assert details_from_dict(given, "d")["certificate"]["issued"] == date.today().isoformat()
+    given["certificate"]["end"] = "2999-01-01"
+    with pytest.raises(InputError, match="is before the end of the measurement, 2999-01-01"):
+        details_from_dict(given, "d")
+
+
+def test_the_texts_are_english_whatever_the_language_of_names():
+    given = details_from_dict(changed("de", "certificate", "language"), "d.yaml")
+    core = ET.fromstring(certificate(RESULT, given))[0][1]
+    assert [item.text for item in core.findall("dcc:usedLangCodeISO639_1", IN)] == ["de", "en"]
+    assert [item.text for item in core.findall("dcc:mandatoryLangCodeISO639_1", IN)] == ["en"]
+
+
+def test_scope_and_uncertainty_are_stated():
+    assert "only to the item calibrated" in " ".join(statement(written(), "Scope").itertext())
+    assert "JCGM 100:2008" in " ".join(statement(written(), "Uncertainty").itertext())
+    assert not named(written(BAD, not_qualified=True), "Uncertainty")
+    titles = {section.title: " ".join(section.notes)
+              for section in certificate_chapter(BAD, details()).sections}
+    assert "No statement of the uncertainty is valid" in titles["Agreement of readings and model"]
+    assert "Uncertainty" not in titles and "item calibrated" in titles["Scope"]
+
+
+def test_the_largest_u_of_the_budget_is_that_of_the_worst_node():
+    emap, root = RESULT.error_map, written()
+    worst = max(emap.u_gx.max(), emap.u_gy.max())
+    for name, u, word in (("at the nodes of the map", worst, "largest "),
+                          ("anywhere", worst, "largest at most ")):
+        [budget] = [item for item in root.iter(f"{{{DCC}}}result") if name in item.findtext(
+            "dcc:name/dcc:content", "", IN) and "XY" in item.findtext(
+                "dcc:name/dcc:content", "", IN)]
+        text = next(" ".join(item.itertext()) for item in budget.iter(f"{{{DCC}}}quantity")
+                    if "combined" in item.findtext("dcc:name/dcc:content", "", IN))
+        said = float(re.search(rf"{word}([-.e\d]+)", text)[1])
+        assert said == pytest.approx(u, rel=5e-3) if name != "anywhere" else said > u
+
+
+def run(seed, reference=None):
+    rng = np.random.default_rng(1)
+    plan = hu_plan(Artifact(5, 0.01, 8), 2)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    readings = simulate_measurements(truth, plan, np.random.default_rng(seed), sigma_m=2e-8,
+                                     sigma_theta_rad=2e-5)
+    return Part(f"{seed}.json", (found := worded(calibrate(readings, Options(
+        reference=reference, causes=False)))).error_map, found)
+
+
+def test_a_mean_is_traceable_if_all_its_runs_are():
+    warm, cold = (CERTIFIED.at_temperature(f"{t}:.1:5e-7:5e-8") for t in (21, 20.5))
+    for references, traceable in (((warm, cold), True), ((warm, warm), True),
+                                  ((warm, CERTIFIED), False)):
+        parts = [run(seed, reference) for seed, reference in zip((5, 6), references, strict=True)]
+        mean = worded(combine(parts, keep_scale=True).result)
+        assert is_traceable(mean) is traceable
+        root = written(mean)
+        text = " ".join(statement(root, "Metrological traceability").itertext())
+        assert ("used at 20.5 °C" in text) is (cold in references) and "used at 21 °C" in text
+        assert [named(root, f"readings of {part.name}") != [] for part in parts] == [True, True]
+        assert is_traceable(result_from_dict(result_to_dict(mean), "m")) is traceable
+    table = Part("t.csv", run(7).error_map)
+    assert not is_traceable(combine([run(5, warm), table], keep_scale=True).result)
+
+
+def test_a_mean_has_u_of_its_squareness():
+    mean = worded(combine([run(5), run(6)]).result)
+    value, U_O, k = scalar(written(mean), "non-orthogonality O")
+    cover, _ = xy_covariance(mean, np.ones((5, 5), dtype=bool))
+    at = mean.artifact
+    columns = np.array([np.concatenate([a.ravel(), b.ravel()]) for a, b in (
+        (at.y_m, at.x_m), (at.x_m, -at.y_m), (at.x_m, at.y_m), (-at.y_m, at.x_m),
+        (1 + 0 * at.x_m, 0 * at.x_m), (0 * at.x_m, 1 + 0 * at.x_m))]).T
+    row = np.linalg.pinv(columns)[0]
+    assert pytest.approx(k * np.sqrt(row @ cover @ row), rel=1e-4) == U_O
+    assert k == pytest.approx(mean.noise.k_xy, rel=1e-4) and value == pytest.approx(
+        mean.error_map.nonorthogonality)
+
+
+def test_a_prior_is_refused_for_people_too():
+    held = replace(RESULT, extra={**RESULT.extra, PRIOR: {}})
+    for write in (certificate, certificate_chapter):
+        with pytest.raises(InputError, match="a prior is part of the map"):
+            write(held, details())
+
+
 def without(*path):
     data = yaml.safe_load(DETAILS.read_text())
     inner = data
@@ -225,7 +403,12 @@ def changed(value, *path):
      "certificate.country: 'Germany' is not a country code of two capitals, e.g. DE"),
     (changed("EN", "certificate", "language"), "'EN' is not a language code"),
     (changed("20.11.2026", "certificate", "begin"), "'20.11.2026' is not a date YYYY-MM-DD"),
-    (changed("2026-11-19", "certificate", "end"), "2026-11-19 is before 2026-11-20"),
+    (changed("2026-11-19", "certificate", "end"), "2026-11-19 is before 2026-11-21"),
+    (changed("2026-11-20", "certificate", "issued"),
+     "certificate.issued: 2026-11-20 is before the end of the measurement, 2026-11-21; correct"),
+    (changed("2026-11-20", "equipment", 0, "valid_until"),
+     r"equipment\[0\].valid_until: 2026-11-20 is before the end of the measurement, 2026-11-21"),
+    (changed("soon", "equipment", 1, "valid_until"), r"equipment\[1\].valid_until: 'soon' is not"),
     (changed("here", "certificate", "place"), "place: 'here' is not one of laboratory, customer"),
     (changed("x", "certificate", "idd"), "certificate.idd: is unknown; did you mean 'id'"),
     (changed({}, "instruments"), "instruments: is unknown"),

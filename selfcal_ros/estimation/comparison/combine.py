@@ -16,6 +16,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import require_same_lattice
+from selfcal_ros.estimation.comparison.runs import exposures, shared_reference
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -273,6 +274,7 @@ def _waves(lines: np.ndarray) -> np.ndarray:
 def _result(parts: Sequence[Part], first: CalibrationResult, xy: tuple[np.ndarray, Mean],
             theta: tuple[np.ndarray, Mean | None]) -> CalibrationResult:
     (known, mean), (lines, angular), plate = xy, theta, first.plate
+    runs = [part.result for part in parts]
     n = int(known.sum())
     gx, gy = (_filled(part, known) for part in (mean.values[:n], mean.values[n:]))
     u_gx, u_gy = (_filled(part, known) for part in (mean.u[:n], mean.u[n:]))
@@ -294,8 +296,9 @@ def _result(parts: Sequence[Part], first: CalibrationResult, xy: tuple[np.ndarra
               dof_map_xy=dof[0], dof_map_theta=dof[1]),
         input={"file": ", ".join(part.name for part in parts)}, method=COMBINED,
         sense=first.sense, extra=_extra(parts, xy, theta), verdict=_verdict(parts, mean, angular),
-        model=ModelResult(first.model.misalignment), reference=first.reference,
-        provenance=Provenance(version=__version__),
+        model=ModelResult(first.model.misalignment),
+        reference=shared_reference(runs, mean.weights),
+        provenance=Provenance(version=__version__, extra=exposures(runs)),
         findings=(Finding("not_in_all", details={"sites": int((~known).sum())}),)
         if not known.all() else (),
         placed_plate=first.placed_plate)

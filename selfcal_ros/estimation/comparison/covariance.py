@@ -30,7 +30,7 @@ from selfcal_ros.estimation.normal.systems import Marks, system_of
 from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.result import PRIOR, CalibrationResult
+from selfcal_ros.model.result import COMBINED, PRIOR, CalibrationResult
 from selfcal_ros.model.view import View
 
 MAX_LINES = 1024
@@ -136,7 +136,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
-    if PRIOR in result.extra or result.method == "law":
+    if PRIOR in result.extra or result.method in ("law", COMBINED):
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
         cover, whole = xy_covariance(result, known)
         if not whole:

@@ -173,15 +173,17 @@ class Budget:
     """Budget of one quantity: its lines and their sum.
 
     `quantity` is ``xy`` (one coordinate) or ``theta``, `anywhere` whether the map is interpolated
-    between its nodes or lines; `unit` is ``m`` or ``rad``; `u_rms`, `u_max` the combined standard
-    uncertainty; `dof` the effective degrees of freedom (Welch-Satterthwaite, GUM G.4); `k` the
-    coverage factor for 95.45 %; `U_rms`, `U_max` the expanded uncertainty.
+    between its nodes or lines; `worst` is the standard uncertainty of the worst node or line;
+    `unit` is ``m`` or ``rad``; `u_rms`, `u_max` the combined standard uncertainty; `dof` the
+    effective degrees of freedom (Welch-Satterthwaite, GUM G.4); `k` the coverage factor for
+    95.45 %; `U_rms`, `U_max` the expanded uncertainty.
     """
 
     quantity: str
     anywhere: bool
     lines: tuple[BudgetLine, ...]
     dof: float
+    worst: float
 
     @property
     def unit(self) -> str:
@@ -200,8 +202,9 @@ class Budget:
 
     @property
     def u_max(self) -> float:
-        """Combined standard uncertainty at the worst site."""
-        return float(np.sqrt(sum(line.effect_max**2 for line in self.lines)))
+        """Combined standard uncertainty at the worst node; anywhere, at most."""
+        return float(np.hypot(self.worst, sum(
+            line.effect_max for line in self.lines if line.component == INTERPOLATION)))
 
     @property
     def U_rms(self) -> float:
@@ -210,7 +213,7 @@ class Budget:
 
     @property
     def U_max(self) -> float:
-        """Expanded uncertainty at the worst site."""
+        """Expanded uncertainty at the worst node; anywhere, at most."""
         return self.k * self.u_max
 
 
@@ -221,15 +224,18 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     error. None without an uncertainty map.
     """
     lines, found = result.budget or tuple(budget_lines(result)), []
-    for quantity, dof in (("xy", result.noise.dof_of("xy")),
-                          ("theta", _dof(result.noise, "theta"))):
+    emap = result.error_map
+    for quantity, dof, u in (
+            ("xy", result.noise.dof_of("xy"), np.stack([emap.u_gx, emap.u_gy])),
+            ("theta", _dof(result.noise, "theta"), emap.u_g_theta)):
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
         at_nodes = sum(line.effect_rms**2 for line in nodes)
         between = sum(line.effect_rms**2 for line in anywhere[len(nodes):])
         more = (1 + between / at_nodes) ** 2 if at_nodes > 0 else 1.0
-        found += [Budget(quantity, False, nodes, dof),
-                  Budget(quantity, True, anywhere, dof * more)] if nodes else []
+        worst = float(np.max(u, initial=0.0, where=np.isfinite(u)))
+        found += [Budget(quantity, False, nodes, dof, worst),
+                  Budget(quantity, True, anywhere, dof * more, worst)] if nodes else []
     return found
 
 

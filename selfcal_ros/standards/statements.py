@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a certificate states of a result, for programs and for people, and what it cannot."""
+
+from collections.abc import Iterator
+from datetime import date, timedelta
+from typing import Any
+
+from selfcal_ros.apply import StageMap
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.result import PRIOR, CalibrationResult
+from selfcal_ros.model.verdict import reference_name
+from selfcal_ros.units import UM_PER_M
+
+TRACEABILITY, AGREEMENT = "Metrological traceability", "Agreement of readings and model"
+EXPANDED = ("Each U is the expanded measurement uncertainty after JCGM 100:2008 (GUM): the "
+            "standard uncertainty times the coverage factor stated with it, for a coverage "
+            "probability of 95.45 %.")
+SCOPE = ("The results relate only to the item calibrated, as it was and under the conditions "
+         "stated here.")
+INVALID = "No statement of the uncertainty is valid: the readings contradict the model."
+
+
+def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> None:
+    """Refuse what no certificate can state, with the verdict or without.
+
+    Raises
+    ------
+    InputError
+        If the result has no uncertainties, a prior is part of it, or the readings are not of the
+        days of the certificate. A day either way is a time zone.
+    """
+    if not result.has_uncertainty:
+        raise InputError("certificate", "the result has no uncertainties",
+                         "solve again with --uncertainty always")
+    if PRIOR in result.extra:
+        raise InputError("certificate", "a prior is part of the map: its uncertainty is not that "
+                         "of readings alone", "solve without a prior")
+    core, zone = details["certificate"], timedelta(days=1)
+    times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]
+    if all(times) and "clock" not in core:
+        first, last = (date.fromisoformat(text[:10]) for text in times)
+        begin, end = (date.fromisoformat(core[name]) for name in ("begin", "end"))
+        if first < begin - zone or last > end + zone:
+            raise InputError("certificate", f"the readings are of {first} to {last}, the dates of "
+                             f"performance {begin} to {end}", "correct begin and end, or explain "
+                             "the clock of the readings in certificate.clock")
+
+
+def is_traceable(result: CalibrationResult) -> bool:
+    """Return whether certified lengths, at the temperature of the measurement, set the scale."""
+    reference = result.reference or {}
+    return all(found.get("certificate") and found.get("certified") and found.get("u_relative")
+               for found in reference.get("runs", [reference]))
+
+
+def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]]:
+    """Yield name and texts of what a certificate states of a result, for programs and people."""
+    verdict = result.verdict
+    yield TRACEABILITY, scale_texts(result)
+    yield AGREEMENT, [verdict.sentence or str(verdict.grade), *verdict.reasons,
+                      *([] if verdict.qualified else [INVALID])]
+    if verdict.qualified:
+        yield "Uncertainty", [EXPANDED]
+    yield "Scope", [SCOPE]
+
+
+def scale_texts(result: CalibrationResult) -> list[str]:
+    """Return what sets the scale of a map, and whether it is traceable."""
+    reference = result.reference
+    if not reference:
+        return ["The scale of the map is a convention, relative to the encoders: no reference "
+                "length was used. Form, straightness and squareness do not depend on a reference."]
+    texts = []
+    for found in reference.get("runs", [reference]):
+        texts.append(f"The scale is set by a reference length ({reference_name(found)}): relative "
+                     f"error {found['relative_error']:.4g}, standard uncertainty "
+                     f"{found['u_relative']:.3g}; certificate: "
+                     f"{found.get('certificate') or 'none'}.")
+        if known := found.get("certified"):
+            texts.append(
+                f"Certified at {known['certified_at_c']:g} °C: {known['relative_error']:.4g}, "
+                f"standard uncertainty {known['u_relative']:.3g}; used at "
+                f"{known['temperature_c']:g} °C (u {known['u_temperature_k']:g} K) with the "
+                f"expansion coefficient {known['expansion_per_k']:.4g} 1/K "
+                f"(u {known['u_expansion_per_k']:.2g} 1/K).")
+    if not is_traceable(result):
+        texts.append("Not traceable: this needs a certificate, its uncertainty, and the "
+                     "temperature of the reference (--certificate, --reference-at).")
+    return texts
+
+
+def distance_text(stage: StageMap, a: float, b: float) -> str:
+    """Return the statement U = a + b L on distances in the field, a in m and b in m/m."""
+    nodes = ""
+    if stage.halfway.any():
+        a_nodes, b_nodes = stage.length_uncertainty(anywhere=False)
+        nodes = (f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "
+                 f"· L, without the {stage.method} interpolation between nodes")
+    return (f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
+            f"+ {b * UM_PER_M:.3g} µm/m · L{nodes}; k = {stage.result.noise.k_xy:.3g}, 95.45 %. "
+            "Errors of neighbouring nodes are correlated.")
