@@ -96,6 +96,43 @@ def test_a_table_of_one_of_the_runs_is_the_same_recording(files, tmp_path, capsy
     assert "own.csv: a mean of several runs" in capsys.readouterr().err
 
 
+def negated(text, columns):
+    """Return a table with the sign of some of its columns turned."""
+    head, *rows = text.splitlines()
+    names = head.split(",")
+    return "\n".join([head, *(",".join(
+        repr(-float(cell)) if cell and name.rpartition("_")[0] in columns else cell
+        for name, cell in zip(names, row.split(","), strict=True)) for row in rows)]) + "\n"
+
+
+@pytest.mark.parametrize(("columns", "refused"), [
+    (("gx", "gy"), True), (("g_theta",), True), (("gx", "gy", "g_theta"), True),
+    (("gx",), False), ((), False)])  # an axis alone is wired otherwise: it disagrees
+def test_a_map_of_the_opposite_sign_is_refused_as_such(files, tmp_path, capsys, columns, refused):
+    table, other = tmp_path / "own.csv", tmp_path / "other.csv"
+    assert main(["table", "2.json", "-o", str(table)]) == 0
+    other.write_text(negated(table.read_text(), columns))
+    capsys.readouterr()
+    for order in (["1.json", "3.json", str(other)], [str(other), "1.json"]):
+        assert main(["combine", *order, "-o", "mean.json"]) == (2 if refused else 0)
+        error = capsys.readouterr().err
+        assert (error == f"selfcal combine: {other}: of the opposite sign to 1.json: its negative "
+                "agrees, and it does not; give G = indicated - true, of a result check the "
+                "sense\n") is refused
+
+
+def test_maps_within_their_u_have_no_sign(files, tmp_path):
+    """Errors of 4 u at 25 nodes, and their negative: 5 u are needed to be sure."""
+    given = read_json("1.json")["error_map"]
+    for factor, code in ((4.0, 0), (6.0, 2)):
+        u = {name: (np.sqrt(np.mean(np.square(np.array(given[name], float)))) / factor)
+             for name in ("gx", "gy")}
+        rows = [f"{(i - 2) * 0.01},{(j - 2) * 0.01},{-given['gx'][i][j]},{-given['gy'][i][j]},"
+                f"{u['gx']},{u['gy']}" for i in range(5) for j in range(5)]
+        (tmp_path / "n.csv").write_text("x,y,gx,gy,u_gx,u_gy\n" + "\n".join(rows))
+        assert main(["combine", "1.json", str(tmp_path / "n.csv"), "-o", "mean.json"]) == code
+
+
 HEAD = "x,y,gx,gy,u_gx,u_gy\n"
 
 

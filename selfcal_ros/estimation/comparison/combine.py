@@ -16,7 +16,13 @@ from selfcal_ros.estimation.comparison.covariance import (
     xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import require_same_lattice
-from selfcal_ros.estimation.comparison.runs import exposures, shared_reference
+from selfcal_ros.estimation.comparison.runs import (
+    SAME,
+    Part,
+    exposures,
+    require_own_readings,
+    shared_reference,
+)
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -26,7 +32,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     budget_lines,
     remaining_part,
 )
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, remove_modes, rms
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.result import (
     COMBINED,
     PRIOR,
@@ -52,31 +58,8 @@ DEGREE = 3
 """Degree up to which each polynomial of a map may vary between runs by its own."""
 HARMONICS = 3
 """The same of the angular map, waves per turn."""
-SAME = 1e-3
-"""Difference of two maps, rms over u, below which they are of the same readings: two recordings
-repeat each other no better than their noise."""
-OTHER_UNIT = 300.0
-"""How many times larger the errors in a table are that is not in m or rad."""
 MAX_STORED = 2 * 21 * 21
 """Largest number of coordinates whose covariance is stored: 3.5 MB."""
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A map to be combined: its file, and its calibration; None for a map of other origin.
-
-    `source` is the calibration behind it, also if the map itself was read from a table.
-    """
-
-    name: str
-    error_map: ErrorMap
-    result: CalibrationResult | None = None
-    source: CalibrationResult | None = None
-
-    @property
-    def origin(self) -> CalibrationResult | None:
-        """The calibration behind the map, if it is known."""
-        return self.result or self.source
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +105,7 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
                          "uncertainty in all maps", "combine maps that overlap")
     artifact = first.artifact
     modes = datum_modes(artifact, scale=not keep_scale)
-    _require_own_readings(parts, known, modes)
+    require_own_readings(parts, known, modes)
     modes = modes[:, :, known]
     xy = mean_of([_xy_run(part, known, keep_scale=keep_scale) for part in parts],
                  modes.reshape(len(modes), -1).T, _polynomials(artifact.x_m, artifact.y_m, known))
@@ -186,27 +169,6 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
     return all(run) and run == also and bool(np.isclose(
         one.noise.sigma_xy_repeats, other.noise.sigma_xy_repeats, rtol=SAME, atol=0.0,
         equal_nan=True))
-
-
-def _require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.ndarray) -> None:
-    """Refuse a map that is equal to another one but for its datum, or is in another unit."""
-    emaps = [part.error_map for part in parts]
-    u = [np.stack([emap.u_gx, emap.u_gy]) for emap in emaps]
-    maps = [remove_modes(np.where(known, np.stack([emap.gx, emap.gy]), np.nan), modes)
-            for emap in emaps]
-    lines = [np.diff(emap.g_theta) for emap in emaps]
-    first = next(index for index, part in enumerate(parts) if part.result is not None)
-    for index, part in enumerate(parts):
-        for values, unit, own in ((maps, "µm", u[first]),
-                                  (lines, "µrad", emaps[first].u_g_theta)):
-            ratio = rms(values[index]) / max(rms(values[first]), rms(own))
-            if part.result is None and ratio > OTHER_UNIT:
-                raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
-                                 f"{parts[first].name}: is it in {unit}?", "give m and rad")
-        for other in range(index):
-            if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
-                raise InputError(part.name, f"of the same readings as {parts[other].name}: their "
-                                 "maps are equal", "leave one of them out")
 
 
 def _xy_run(part: Part, known: np.ndarray, *, keep_scale: bool) -> Run:
