@@ -207,3 +207,54 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
         wanted = rows(artifact, place) @ (result.error_map.gx + 1j * result.error_map.gy).ravel()
         x, y = stage.command(place.real, place.imag)
         assert complex(x[0], y[0]) - place[0] == pytest.approx(wanted[0], abs=1e-15)
+
+
+def stage_of(plate, covariance, monkeypatch, halfway=((0, 0), (0, 0))):
+    """Return a stage whose sites have this covariance of Gx, then Gy."""
+    monkeypatch.setattr("selfcal_ros.apply.xy_covariance", lambda _, used: (
+        covariance[np.ix_(*[np.tile(used.ravel(), 2)] * 2)], True))
+    stage = StageMap(result_of(random_map(plate, 1)))
+    stage.halfway = np.array(halfway, dtype=float)
+    return stage
+
+
+def test_u_of_distances_is_a_bound_of_all_pairs_that_one_of_them_meets(monkeypatch):
+    """With x and y correlated, so that one diagonal is worse than the other."""
+    plate = Artifact(3, 0.01, 0, 5)
+    mix = np.random.default_rng(3).normal(size=(30, 30)) * 1e-9
+    mix[15:] += 2 * mix[:15]
+    stage = stage_of(plate, mix @ mix.T, monkeypatch)
+    a, b = stage.length_uncertainty()
+    i, j = np.triu_indices(15, 1)
+    x, y = plate.x_m.ravel(), plate.y_m.ravel()
+    _, u = stage.length_error((x[i], y[i]), (x[j], y[j]))
+    slack = a + b * np.hypot(x[j] - x[i], y[j] - y[i]) - stage.result.noise.k_xy * u
+    assert slack.min() == pytest.approx(0, abs=1e-13)
+
+
+def test_a_distance_anywhere_has_the_interpolation_of_its_own_direction(monkeypatch):
+    """Gx is 8 nm off halfway, Gy nothing: along y the distance is as between nodes."""
+    plate = Artifact(3, 0.01, 0, 3)
+    for row in (0, 1):
+        halfway = np.zeros((2, 2))
+        halfway[row, 0] = 8e-9
+        stage = stage_of(plate, np.diag(np.repeat([1e-18, 9e-18], 9)), monkeypatch, halfway)
+        a, b = stage.length_uncertainty()
+        worst = max(np.sqrt(2 * (1 + 64 * (row == 0))), np.sqrt(2 * (9 + 64 * (row == 1)))) * 1e-9
+        assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * worst, rel=1e-6)
+
+
+def test_cells_of_an_oblong_field_share_no_error_of_interpolation(monkeypatch):
+    """Five nodes along x, nine along y: the last two cells of y are different ones."""
+    plate = Artifact(5, 0.01, 0, 9)
+    stage = stage_of(plate, np.zeros((90, 90)), monkeypatch, [[0, 5e-9], [0, 5e-9]])
+    found = stage.covariance([0.0, 0.0, 0.0], [0.035, 0.025, 0.0251])
+    assert found[0, 0] > 0 and found[0, 1] == 0 and found[1, 2] > 0
+
+
+@pytest.mark.parametrize("plate", [Artifact(3, 0.01, 0, 7), Artifact(7, 0.01, 0, 3)])
+def test_inside_an_oblong_field(plate):
+    stage = StageMap(result_of(random_map(plate, 1)))
+    hx, hy = (half * 0.01 for half in plate.half)
+    np.testing.assert_array_equal(stage.inside([hx, 0, hx + 1e-4, 0], [0, hy, 0, hy + 1e-4]),
+                                  [True, True, False, False])

@@ -126,3 +126,25 @@ def test_cal_export_combines_too(capsys):
     words = ["R.json", "-o", "n.cal", "--onto", "old.cal", "--y-axis", "3"]
     assert main(["cal", "export", *words]) == 2
     assert "it is for axes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("axes", [(1, 2), (2, 1)])
+def test_the_counts_of_pmac_are_those_of_their_motors(axes):
+    """Six cells of 10 mm along x with 1000 counts in a mm, along y with 3000."""
+    x, y = axes
+    assert run(f"pmac R.json -o t.txt --x-axis {x} --y-axis {y} --counts-per-unit {x}=1000 "
+               f"--counts-per-unit {y}=3000") == 0
+    heads = re.findall(r"DEFINE COMP (.*)", Path("t.txt").read_text())
+    assert {head.split(",", 4)[4] for head in heads} == {"60000,180000"}
+
+
+@pytest.mark.parametrize(("options", "offset"), [
+    ("--home-theta 30", 390.0), ("--home-theta 30 --counts-per-unit 3=1000", 30.0),
+    ("--home-theta 30 --reverse-theta --counts-per-unit 3=1000", -30.0)])
+def test_the_home_of_theta_is_in_degrees_of_the_stage(options, offset):
+    """The first line of the stage, at 0 or at -360 degrees, is that far below the home."""
+    write_json("T.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))
+    words = f"cal export T.json -o t.cal --theta-axis 3 {options}".split()
+    assert main(words) == 0
+    found = re.search(r"^:START\S* OFFSET=(\S+)$", Path("t_theta.cal").read_text(), re.M)
+    assert float(found[1]) == offset

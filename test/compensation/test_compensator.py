@@ -316,3 +316,15 @@ def test_cubic_pieces_are_those_of_scipy(count, periodic):
     want = CubicSpline(np.arange(len(closed)), closed,
                        bc_type="periodic" if periodic else "not-a-knot").c[::-1]
     np.testing.assert_allclose(cubic_pieces(values, periodic=periodic), want, atol=1e-14)
+
+
+def test_a_fourier_series_goes_through_the_lines_in_their_order():
+    """cos t - 2 sin t + 3 sin 2t in urad, at and between eight lines."""
+    plate = Artifact(3, 0.01, 8, harmonics=2)
+    wanted = lambda t: 1e-6 * (np.cos(t) - 2 * np.sin(t) + 3 * np.sin(2 * t))  # noqa: E731
+    emap, zero = random_map(plate, 1), np.zeros(8)
+    stage = Compensator(ErrorMap(plate, emap.gx, emap.gy, emap.u_gx, emap.u_gy,
+                                 wanted(plate.theta_rad), zero))
+    angle = np.linspace(-3, 9, 25)
+    np.testing.assert_allclose(stage.error_theta(angle), wanted(angle), atol=1e-18)
+    assert stage.correct_angle(0.7 + wanted(0.7)) == pytest.approx(0.7, abs=1e-15)

@@ -161,3 +161,17 @@ def test_bends_are_found_in_the_last_cells_of_both_axes(plate):
         roof = Grid(tuple(first), tuple(step), values, "hold")
         bent = bends_between(numbered(plate), MM, lambda px, py, r=roof: (r.at(px, py), 0 * px))
         assert bent == pytest.approx(2e-6, rel=1e-9)
+
+
+@pytest.mark.parametrize("axes", [(1, 2), (7, 4)])
+def test_pmac_defines_the_higher_motor_first(axes):
+    """The tables are stored downwards from the last motor."""
+    lines = FORMATS["pmac"].write(numbered(WIDE), Wiring(MachineFrame(*axes), (1e4, 1e4)))[""]
+    assert [line for line in lines if re.fullmatch(r"#\d", line)] == [
+        f"#{axis}" for axis in sorted(axes, reverse=True)]
+
+
+def test_beckhoff_names_the_slave_of_each_list():
+    files = FORMATS["beckhoff"].write(numbered(WIDE), Wiring(MachineFrame(5, 3)))
+    assert files["x"][:2] == ["kopf.achs_nr 5", "kopf.log_achs_name X"]
+    assert files["y"][:2] == ["kopf.achs_nr 3", "kopf.log_achs_name Y"]
