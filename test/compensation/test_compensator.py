@@ -328,3 +328,16 @@ def test_a_fourier_series_goes_through_the_lines_in_their_order():
     angle = np.linspace(-3, 9, 25)
     np.testing.assert_allclose(stage.error_theta(angle), wanted(angle), atol=1e-18)
     assert stage.correct_angle(0.7 + wanted(0.7)) == pytest.approx(0.7, abs=1e-15)
+
+
+@pytest.mark.parametrize(("field", "axis"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+def test_the_error_halfway_is_that_of_its_field_along_its_axis(field, axis):
+    """One field is a parabola along one axis, which a line misses by its curvature over eight."""
+    plate = Artifact(7, 0.01, 0, 9)
+    fields = np.zeros((2, 7, 9))
+    fields[field] = 1e-3 * (plate.x_m, plate.y_m)[axis] ** 2
+    none = np.full((7, 9), 1e-15)
+    found = Compensator(ErrorMap(plate, *fields, none, none, np.zeros(0), np.zeros(0))).halfway
+    assert found[field, axis] > 1e-9
+    found[field, axis] = 0
+    assert found.max() < 1e-12

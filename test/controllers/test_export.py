@@ -224,6 +224,9 @@ def test_a_table_replaces_the_one_that_was_active(name, frame):
     assert np.abs(off).max() < {"pmac": 3e-8, "linuxcnc": 2e-9, "siemens": 2e-9}.get(name, 1e-10)
     assert np.abs(made.residuals[0].after).max() < 3e-8 < 1e-7 < made.residuals[0].rms("before")
     assert "replaces the table" in next(iter(made.files.values()))
+    g = np.stack([seen.gx, seen.gy])  # what the machine has now, not without the old table
+    g = g - g.mean(axis=(1, 2), keepdims=True)
+    assert made.residuals[0].rms("before") == pytest.approx(np.sqrt((g**2).sum(0).mean()), rel=0.01)
 
 
 @pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[5]])

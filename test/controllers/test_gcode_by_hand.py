@@ -155,3 +155,13 @@ def test_comments_come_first_in_the_form_of_the_program(program, head):
 def test_a_comment_has_no_character_that_could_end_it():
     assert commented("(a)\nG0\n", ["a (b) \u00b5 c"]).splitlines()[0] == "(a _b_ _ c)"
     assert len(commented("G0\n", ["x" * 300]).splitlines()[0]) == 202
+
+
+@pytest.mark.parametrize(("arc", "top"), [
+    ("G2 X10 R10", 10 - 75**0.5), ("G3 X10 R10", 75**0.5 - 10),
+    ("G2 X10 R-10", 10 + 75**0.5), ("G3 X10 R-10", -10 - 75**0.5)])
+def test_an_arc_by_its_radius_bulges_to_the_side_of_its_sense(arc, top):
+    """From (0, 0): clockwise over the chord, and with a negative radius the longer way."""
+    y = places(rewritten(f"G0 X0 Y0\n{arc} Y0\n", tolerance=1e-3))[:, 1]
+    assert y[abs(y).argmax()] == pytest.approx(top, abs=2e-3)
+    assert (y * np.sign(top) > -1e-3).all() or abs(top) > 10
