@@ -77,9 +77,12 @@ def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns
     Raises
     ------
     InputError
-        If the file has no summary, has an attachment of this name, or is written to meanwhile.
+        If the file has no summary, has an attachment of this name, is write-protected, or is
+        written to meanwhile.
     """
     path = BagReader(Path(bag)).files[0]
+    if not path.stat().st_mode & 0o222:  # a new file in its place would not ask
+        raise InputError(str(path), "is write-protected", "allow writing to it, or take a copy")
     state = _state(path)
     taken = set(attached(bag))
     for name, *_ in items:

@@ -117,8 +117,7 @@ def test_a_map_of_the_opposite_sign_is_refused_as_such(files, tmp_path, capsys, 
         assert main(["combine", *order, "-o", "mean.json"]) == (2 if refused else 0)
         error = capsys.readouterr().err
         assert (error == f"selfcal combine: {other}: of the opposite sign to 1.json: its negative "
-                "agrees, and it does not; give G = indicated - true, of a result check the "
-                "sense\n") is refused
+                "agrees, and it does not; give G = indicated - true\n") is refused
 
 
 def test_maps_within_their_u_have_no_sign(files, tmp_path):

@@ -256,3 +256,15 @@ def test_a_file_that_gives_nothing_yet_is_not_waited_for():
         assert bag_files(Path("/proc/kmsg")) == []
     finally:
         os.close(log)
+
+
+def test_a_bag_that_is_write_protected_is_left_alone(bag, tmp_path, capsys):
+    """The folder is not: a new file in place of the bag would be possible."""
+    note, [file] = tmp_path / "note.txt", sorted(bag.glob("*.mcap"))
+    note.write_text("n")
+    before = file.read_bytes()
+    file.chmod(0o444)
+    assert main(["embed", str(bag), str(note)]) == 2
+    assert capsys.readouterr().err == (f"selfcal embed: {file}: is write-protected; allow writing "
+                                       "to it, or take a copy\n")
+    assert file.read_bytes() == before

@@ -60,11 +60,11 @@ def require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.nda
                                  f"{parts[first].name}: is it in {unit}?", "give m and rad")
         for signed, spread in ((maps, u), (lines, [np.sqrt(2) * emap.u_g_theta[1:]
                                                    for emap in emaps])):
-            if index != first and _is_opposite(*(signed[n] / np.maximum(spread[n], TINY)
+            if part.result is None and _is_opposite(*(signed[n] / np.maximum(spread[n], TINY)
                                                  for n in (index, first))):
                 raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
                                  "negative agrees, and it does not",
-                                 "give G = indicated - true, of a result check the sense")
+                                 "give G = indicated - true")
         for other in range(index):
             if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
                 raise InputError(part.name, f"of the same readings as {parts[other].name}: their "

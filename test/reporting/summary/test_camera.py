@@ -47,7 +47,7 @@ def test_cells_of_images_are_no_views():
     assert state_sentence(result()).startswith("Calibrated from 2 views with images of 9 marks: ")
     assert "2 views with images of 9 marks, 2 measured" in summary_text(result())
     assert [view.name for view in views_in(result())] == ["0", "90"]
-    named = standards._meta(result())
+    named = standards._meta(result(), {})
     assert "view 0, cell [+1,-1]" in [name for name, _ in named]
 
 
