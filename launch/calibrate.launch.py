@@ -13,9 +13,10 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         *arguments("cell.yaml"),
         journal_argument("selfcal_journals"),
-        DeclareLaunchArgument("compensate", default_value="false",
+        # choices, as launch leaves nodes running that it started before a wrong condition
+        DeclareLaunchArgument("compensate", default_value="false", choices=["true", "false"],
                               description="publish corrected joint states as well"),
-        DeclareLaunchArgument("detect", default_value="false",
+        DeclareLaunchArgument("detect", default_value="false", choices=["true", "false"],
                               description="find marks in stage/image as well"),
         node("mark_detector", condition=IfCondition(LaunchConfiguration("detect"))),
         node("measurement_collector", {"journal": text("journal")}),

@@ -46,7 +46,7 @@ def arguments(params: str) -> list[Any]:
                  description="lowest level that nodes log"),
         argument("foxglove", default_value="false", choices=["true", "false"],
                  description="also start foxglove_bridge, port 8765 (package foxglove_bridge)"),
-        OpaqueFunction(function=refuse_missing)]
+        OpaqueFunction(function=refuse_wrong)]
 
 
 def journal_argument(folder: str) -> DeclareLaunchArgument:
@@ -57,12 +57,18 @@ def journal_argument(folder: str) -> DeclareLaunchArgument:
         "a restarted collector continues; none = no journal")
 
 
-def refuse_missing(context: LaunchContext) -> None:
-    """End the launch before a node starts if the parameter file or foxglove_bridge is missing.
+def refuse_wrong(context: LaunchContext) -> None:
+    """End the launch before a node starts if parameter file or foxglove_bridge is missing.
 
-    launch_ros ignores the one, and of the other leaves the nodes running that it had started.
+    Or if `rate` is not a number. launch_ros ignores the first, and on the others leaves the nodes
+    running that it had started.
     """
     given = context.launch_configurations
+    try:
+        float(given.get("rate", "1"))
+    except ValueError:
+        raise InputError(f"rate:={given['rate']}", "not a number",
+                         "give the speed; 0 = as fast as the nodes can follow") from None
     if not Path(given["params"]).is_file():
         raise InputError(f"params:={given['params']}", "no such file", "check the path")
     if given["foxglove"] == "true" and "foxglove_bridge" not in get_packages_with_prefixes():

@@ -70,12 +70,16 @@ def launched(run, name: str, *arguments: str) -> subprocess.CompletedProcess:
     return run("-c", LAUNCH, f"launch/{name}", *arguments)
 
 
-def test_a_whole_calibration(run, tmp_path):
-    plan, params = tmp_path / "plan.yaml", tmp_path / "params.yaml"
+@pytest.mark.parametrize("arguments", [
+    ["params:=config/params/simulated_cell.yaml"],
+    ["params:=config/params/simulated_camera.yaml", "plan:=config/plans/camera.yaml",
+     "camera:=config/simulations/camera.yaml", "namespace:=cell2"]],
+    ids=["detections", "images, in a namespace"])
+def test_a_whole_calibration(run, tmp_path, arguments):
+    plan = tmp_path / "plan.yaml"
     plan.write_text(yaml.safe_dump(PLAN))
-    params.write_text((ROOT / "config/params/simulated_cell.yaml").read_text())
     done = run("-m", "launch_testing.launch_test", "test/launch/whole_calibration.py",
-               f"plan:={plan}", f"params:={params}")
+               f"plan:={plan}", *arguments)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-6000:]
 
 
@@ -103,6 +107,18 @@ def test_a_parameter_file_that_is_not_there_starts_nothing(run, tmp_path, file):
     said = done.stdout + done.stderr
     assert f"params:={tmp_path / 'no.yaml'}: no such file; check the path" in said
     assert "process started" not in said
+    assert done.returncode == 1
+
+
+@pytest.mark.parametrize(("file", "argument", "problem"), [
+    ("calibrate", "compensate:=2", "\"compensate\" provided value \"2\" is not valid"),
+    ("calibrate", "detect:=maybe", "\"detect\" provided value \"maybe\" is not valid"),
+    ("replay", "rate:=fast", "rate:=fast: not a number; give the speed")])
+def test_a_wrong_value_starts_nothing(run, file, argument, problem):
+    """Nodes that it had started would go on without the launch; `run` waits for their end."""
+    done = launched(run, f"{file}.launch.py", argument, "bag:=x", "journal:=none")
+    assert problem in done.stdout + done.stderr
+    assert "process started" not in done.stdout + done.stderr
     assert done.returncode == 1
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """For `launch_test`: the simulated cell runs a plan to its end, and ends when it is told to.
 
-``launch_test test/launch/whole_calibration.py plan:=PLAN.yaml params:=PARAMS.yaml``
+``launch_test test/launch/whole_calibration.py plan:=PLAN.yaml params:=PARAMS.yaml``, with
+``camera:=SIM.yaml`` and ``namespace:=NAME`` as well.
 """
 
 import time
@@ -18,13 +19,13 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 PATIENCE_S = 180.0
-ARGUMENTS = ("plan", "params")
+ARGUMENTS = {"plan": None, "params": None, "camera": "", "namespace": ""}
 
 
 def generate_test_description() -> LaunchDescription:
     share = Path(get_package_share_directory("selfcal_ros"))
     return LaunchDescription([
-        *(DeclareLaunchArgument(name) for name in ARGUMENTS),
+        *(DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(share / "launch/simulated_cell.launch.py")),
             launch_arguments={name: LaunchConfiguration(name) for name in ARGUMENTS}.items()),
@@ -36,7 +37,7 @@ class TestCalibration(unittest.TestCase):
 
     def setUp(self):
         rclpy.init()
-        self.node = rclpy.create_node("onlooker")
+        self.node = rclpy.create_node("onlooker", namespace=self.test_args.get("namespace", ""))
 
     def tearDown(self):
         self.node.destroy_node()
