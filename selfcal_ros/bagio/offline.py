@@ -205,8 +205,6 @@ class Playlist:
         Namespace of the cell in the bag, None = the only one.
     seed : int
         Shuffles the order of arrival, not the times; negative = as recorded.
-    with_images : bool
-        Whether a bag without detections shows its marks by its images.
 
     Attributes
     ----------
@@ -216,8 +214,7 @@ class Playlist:
         Topic -> number of messages, without topics that have none.
     """
 
-    def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1, *,
-                 with_images: bool = False) -> None:
+    def __init__(self, bag: Path, namespace: str | None = None, seed: int = -1) -> None:
         self._bag, self._namespace = bag, namespace
         reader = BagReader(bag, namespace)
         times, topics = _times_and_topics(reader.cdr_messages())
@@ -226,7 +223,7 @@ class Playlist:
             reader = self._reader()
             times, topics = _times_and_topics(reader.cdr_messages())
         self.lost = [*reader.lost, *reader.future_lines()]
-        self._has_images = self._shows_images(reader, with_images, DETECTION_TOPIC in {
+        self._has_images = self._shows_images(reader, DETECTION_TOPIC in {
             TOPICS[number] for number in set(topics)})
         if self._has_images:
             images = ImageBag(bag, namespace)
@@ -245,23 +242,20 @@ class Playlist:
             order = mixed if order is None else order[mixed]
         self._order = order
 
-    def _shows_images(self, reader: BagReader, with_images: bool, has_detections: bool) -> bool:
-        """Return whether images are played; say of others that they are not.
+    @property
+    def transport(self) -> str:
+        """The transport of the images that take the place of detections, "" without."""
+        return next((transport for transport, topic in IMAGE_TOPICS.items()
+                     if topic in self.counts), "")
 
-        Raises
-        ------
-        InputError
-            If nothing else shows marks.
-        """
+    def _shows_images(self, reader: BagReader, has_detections: bool) -> bool:
+        """Return whether images are played; say of others that they are not."""
         images = [topic for topic in reader.topics
                   if f"/{topic}".endswith(tuple(f"/{role}" for role in IMAGE_TOPICS.values()))]
-        if not images or (with_images and not has_detections):
+        if not images or not has_detections:
             return bool(images)
-        what, remedy = f"images on {', '.join(images)} are not played", (
-            f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them")
-        if not has_detections:
-            raise InputError(str(self._bag), f"{what}, and there are no detections", remedy)
-        self.lost.append(f"{what}: {remedy}")
+        self.lost.append(f"images on {', '.join(images)} are not played: "
+                         f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them")
         return False
 
     def _messages(self, images: ImageBag | None = None) -> Iterable[tuple[str, int, bytes]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
-from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.detector import OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
@@ -18,11 +18,6 @@ from selfcal_ros.vision.exposures import ImageDetector
 
 SHOWN = 5
 """Number of problems that are printed."""
-
-
-OPTIONS = {name: name for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity",
-                                   "turn", "mirror")}
-"""Options for parameters of mark_detector -> their names."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -6,25 +6,28 @@ import contextlib
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
-from selfcal_ros.bagio.offline import bag_input, clock_lines
+from selfcal_ros.bagio.offline import Playlist, bag_input, clock_lines
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
 from selfcal_ros.cli.terminal import (
     add_json,
+    add_parameters,
     aside,
     exit_code,
     file_of,
+    given,
     node_settings,
     on_stdout,
     progress_bar,
     put,
     show,
 )
+from selfcal_ros.collection.settings.detector import OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_json
+from selfcal_ros.files import read_json, write_yaml
 from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
@@ -35,7 +38,8 @@ NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
+    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder; of one with "
+                        "images and no detections mark_detector finds the marks")
     speed = parser.add_mutually_exclusive_group()
     speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
     speed.add_argument("--fast", action="store_true", help="as fast as the nodes can follow")
@@ -48,6 +52,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
+    images = parser.add_argument_group("for a bag with images and no detections", "options of "
+                                       "mark_detector, as in selfcal detect, or in NODES.yaml")
+    add_parameters(images, DetectorSettings, OPTIONS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,11 +66,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--shuffle", f"{args.shuffle} is not a seed",
                          f"give a number from 0 to {LARGEST_SEED}")
     check_outputs([args.bag, args.params], [file_of(args)])
-    source = bag_input(args.bag)
+    source, detector = bag_input(args.bag), detector_of(args)
     with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
           domain() as environment):
         saved = folder / "result.json"
-        code, lost = _play(args, saved, environment)
+        code, lost = _play(args, saved, environment, detector)
         clock, refused = _clock_lines(args)
         if code or not saved.exists():
             return code or 1
@@ -81,6 +88,30 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(result)
 
 
+def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
+    """Return the parameters of mark_detector for a bag whose images are played; None for others.
+
+    Raises
+    ------
+    InputError
+        If one of them is missing or wrong, or is given where no image is played.
+    """
+    options = given(args, OPTIONS)
+    transport = Playlist(Path(args.bag), args.namespace).transport
+    if not transport:
+        for name in (name for name, value in options.items() if value is not None):
+            raise InputError(f"--{name.replace('_', '-')}", f"no images of {args.bag} are played",
+                             "leave it out; it is for bags with images and no detections")
+        return None
+    from selfcal_ros.vision.detector import MarkDetector  # with scipy, for images only
+
+    settings = node_settings(args.params, DetectorSettings, **options)
+    MarkDetector(settings, f"{args.bag} has images and no detections: {args.params or 'options'}")
+    way = DetectorSettings(transport=transport)  # how images reach it is not the user's here
+    return replace(settings, transport=transport, max_waiting=way.max_waiting,
+                   autostart=way.autostart)
+
+
 def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
     """Print and return the clock steps in the bag, which no node can detect during fast replay.
 
@@ -93,13 +124,19 @@ def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
     return lines, refused
 
 
-def _play(args: argparse.Namespace, saved: Path, environment: dict) -> tuple[int, list[str]]:
+def _play(args: argparse.Namespace, saved: Path, environment: dict,
+          detector: DetectorSettings | None) -> tuple[int, list[str]]:
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate
     cell = "" if args.namespace is None else f"/{args.namespace.strip('/')}"
     with contextlib.ExitStack() as stack:
         own = {"solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]}
+        if detector is not None:
+            file = saved.with_name("mark_detector.yaml")
+            write_yaml(file, {detector.NODE: {"ros__parameters": asdict(detector)}})
+            stack.enter_context(process(f"selfcal_ros.nodes.{detector.NODE}", [
+                "--ros-args", "--params-file", str(file), *quiet], environment))
         for node in NODES:
             stack.enter_context(process(f"selfcal_ros.nodes.{node}",
                                         [*rest, *own.get(node, []), *quiet], environment))

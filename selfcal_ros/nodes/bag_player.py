@@ -29,8 +29,7 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         self.exit_code = ExitCode.DONE
         listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
         self.player = Player(self, self.settings.bag, rate=self.settings.rate,
-                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE,
-                             with_images=True)
+                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE)
         self._patience = time.monotonic() + patience_s
         self._started = not listener or not patience_s
         self.every(0.002, self._step)

@@ -33,11 +33,10 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
 
     def configure(self) -> None:
         """Create the session and the publisher."""
-        publish = self.output(names.DETECTIONS)
+        self._output = self.output(names.DETECTIONS)
         self._received = self.publisher(names.private(names.RECEIVED))
-        self._taken = 0
-        self.session = DetectingSession(self.settings, self.ports(
-            lambda output, fields: publish(fields)))
+        self._taken = self._found = 0
+        self.session = DetectingSession(self.settings, self.ports(self._publish))
 
     def activate(self) -> None:
         """Subscribe to the images."""
@@ -50,6 +49,10 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         self.every(TICK_S, self._look)
         self._tell_taken()
 
+    def _publish(self, _output: str, fields: dict[str, Any]) -> None:
+        self._output(fields)
+        self._found += 1
+
     def _take(self, data: bytes, _received_ns: int) -> None:
         self._taken += 1
         try:
@@ -58,7 +61,7 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
             self._tell_taken()
 
     def _tell_taken(self) -> None:
-        self._received.publish(names.RECEIVED.type(data=[self._taken]))
+        self._received.publish(names.RECEIVED.type(data=[self._taken, self._found]))
 
     def _look(self) -> None:
         """Take a few waiting images, and count the lost ones by their numbers."""

@@ -69,8 +69,8 @@ CORRECTED_MOTION = Topic(topics.CORRECTED_MOTION_TOPIC, JointState, _qos(1000))
 # below the node's own name (~/)
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
 RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
-"""The collector's counts of encoder samples, detections and commands, or the detector's of images,
-for a player's pace."""
+"""The collector's counts of encoder samples, detections and commands, or the detector's of images
+taken and detections published, for a player's pace."""
 SOLVED = Topic("solved", String, _qos(1, latched=True))
 """The solver's fingerprint of the readings behind its results."""
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.publisher import Publisher
-from rclpy.qos import ReliabilityPolicy
 
 from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.collection.settings.detector import DetectorSettings
@@ -17,6 +15,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.nodes.hearing import not_heard
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS
 from selfcal_ros.units import S_PER_NS
 
@@ -41,26 +40,25 @@ class Player:
     Messages are sent as the bytes in the bag, or re-encoded if its types have other
     trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
     `namespace` is that of the cell in the bag, None = the only one; `listener` is the node that
-    sets the pace. With `with_images` images take the place of missing detections, at the pace of
-    mark_detector in the node's namespace.
+    sets the pace. Images take the place of missing detections, at the pace of mark_detector in the
+    node's namespace.
     """
 
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
-                 namespace: str | None = None, listener: str = CollectorSettings.NODE,
-                 with_images: bool = False) -> None:
+                 namespace: str | None = None, listener: str = CollectorSettings.NODE) -> None:
         self.node, self.rate, self._bag = node, rate, bag
         own = node.get_namespace().rstrip("/")
         self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
         self.detector = f"{own}/{DetectorSettings.NODE}"
-        self.playlist = Playlist(Path(bag), namespace, seed, with_images=with_images)
+        self.playlist = Playlist(Path(bag), namespace, seed)
         if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
         self._messages = iter(self.playlist)
         first = next(self._messages)
         self._next: tuple[str, int, bytes] | None = first
         self._first_ns = first[1]
-        images = [names.image_topics(transport, IMAGE_DEPTH)[0] for transport, topic
-                  in IMAGE_TOPICS.items() if topic in self.playlist.counts]
+        transport = self.playlist.transport
+        images = names.image_topics(transport, IMAGE_DEPTH)[:1] if transport else []
         # detections of images are the detector's
         played = [topic for topic in names.INPUTS if not images or topic.name != DETECTION_TOPIC]
         self._publishers = {topic.name: node.publisher(topic) for topic in (*played, *images)}
@@ -73,6 +71,7 @@ class Player:
         received = names.of_node(self.listener, names.RECEIVED)
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
+        self._has_images = bool(images)
         if images:
             taken = names.of_node(self.detector, names.RECEIVED)
             self._detector_tells = partial(node.count_publishers, taken.name)
@@ -80,6 +79,8 @@ class Player:
 
     taken: int | None = None
     """Images that the detector has taken."""
+    found = 0
+    """Detections that it has published."""
     _taken_before = 0
 
     @property
@@ -114,17 +115,16 @@ class Player:
         return played if waits else self._not_heard(played, self.detector)
 
     def _not_heard(self, topics: list[str], by: str) -> list[str]:
-        hears = {topic: self._hears(self._publishers[topic], by) for topic in topics}
-        return [topic + (" reliably (another publisher offers best effort)" if found else "")
-                for topic, found in hears.items() if ReliabilityPolicy.RELIABLE not in found]
+        return not_heard(self.node, {topic: self._publishers[topic] for topic in topics}, by)
 
-    def _hears(self, publisher: Publisher, by: str) -> list[ReliabilityPolicy]:
-        """Return the reliabilities requested by the subscriptions of a node to a publisher."""
-        if not publisher.get_subscription_count():
-            return []
-        readers = self.node.get_subscriptions_info_by_topic(publisher.topic_name)
-        return [reader.qos_profile.reliability for reader in readers
-                if by == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
+    @property
+    def arrived(self) -> bool:
+        """Whether the nodes have received everything sent, and the detections in its images."""
+        if not self._has_images:
+            return self.heard == self.sent
+        return self.taken == self.sent[IMAGES] and self.heard == {
+            KINDS[topic]: self.found if topic == DETECTION_TOPIC else self.sent[KINDS[topic]]
+            for topic in KINDS}
 
     def step(self) -> None:
         """Publish the messages due now."""
@@ -187,7 +187,9 @@ class Player:
             self._before = self._received - self._at + self.sent.get(IMAGES, 0)
 
     def _on_taken(self, message: Any) -> None:
-        taken = int(sum(message.data))
+        if len(message.data) != len(("images", "detections")):
+            return
+        taken, self.found = map(int, message.data)
         if taken < (self.taken or 0):  # a detector that was restarted
             self._taken_before = taken - self.sent[IMAGES]
         self.taken = taken

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node of `selfcal replay`: plays a bag into live nodes up to the saved map.
 
-Run as a process alongside measurement_collector and solver:
+Run as a process alongside measurement_collector and solver, and mark_detector for images:
 ``python -m selfcal_ros.nodes.replay_session BAG RATE SEED RESULT.json NAMESPACE`` (of the
 cell in the bag; empty = the only one). Progress goes to stdout, one line ``progress DONE TOTAL``
 per step, for the command line.
@@ -63,13 +63,15 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         return time.monotonic() > self._deadline
 
     def _wait_for_nodes(self) -> None:
-        alone = self.player.unheard()
+        alone = [f"{node} does not listen to {', '.join(topics)}" for node, topics in (
+            (self.player.listener, self.player.unheard()),
+            (self.player.detector, self.player.unseen())) if topics]
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
         if not alone and ready:
             self._go(self._play)
         elif self._late():
-            self._end(f"{self.player.listener} does not listen to {', '.join(alone)}" if alone
-                      else "no services of collector and solver", ExitCode.INTERNAL)
+            self._end(" and ".join(alone) or "no services of collector and solver",
+                      ExitCode.INTERNAL)
 
     def _play(self) -> None:
         self.player.step()
@@ -80,15 +82,17 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         if self.player.done:
             self._go(self._wait_until_received)
         elif self.player.stalled_s > PATIENCE_S:
-            self._end(f"{self.player.listener} takes no more messages: sent {self.player.sent}, "
-                      f"received {self.player.heard}", ExitCode.INTERNAL)
+            self._end(f"the nodes take no more messages: {self._counts()}", ExitCode.INTERNAL)
 
     def _wait_until_received(self) -> None:
-        if self.player.heard == self.player.sent:
+        if self.player.arrived:
             self._ask(self._finish, Trigger.Request(), self._on_finished)
         elif self._late():
-            self._end(f"messages were lost: sent {self.player.sent}, received "
-                      f"{self.player.heard}", ExitCode.INTERNAL)
+            self._end(f"messages were lost: {self._counts()}", ExitCode.INTERNAL)
+
+    def _counts(self) -> str:
+        images = "" if self.player.taken is None else f", {self.player.taken} images"
+        return f"sent {self.player.sent}, received {self.player.heard}{images}"
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:
         answer = client.call_async(request)

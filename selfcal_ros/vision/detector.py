@@ -85,10 +85,11 @@ class MarkDetector:
     """
 
     def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
-        for name in ("pixel_size", "mark_size"):
-            if not getattr(settings, name) > 0:
-                raise InputError(f"{where}: {name}", "is not set", "give it in m; `selfcal camera "
-                                 "init` finds the size of a pixel")
+        unset = [name for name in ("pixel_size", "mark_size") if not getattr(settings, name) > 0]
+        if unset:
+            verb, them = ("are", "them") if len(unset) > 1 else ("is", "it")
+            raise InputError(f"{where}: {' and '.join(unset)}", f"{verb} not set", f"give {them} "
+                             "in m; `selfcal camera init` finds the size of a pixel")
         self.settings, self._model = settings, MODELS[settings.mark]
         self.size = settings.mark_size / settings.pixel_size
         self._width = settings.mark_width / settings.pixel_size or WIDTH * self.size

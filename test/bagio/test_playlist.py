@@ -10,7 +10,6 @@ from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import EncoderSample
-from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.topics import IMAGE_TYPES, INPUT_TOPICS
@@ -85,11 +84,9 @@ def test_nothing_to_play(tmp_path):
     assert len(playlist) == 0 and playlist.counts == {} and list(playlist) == []
 
 
-def test_a_bag_that_shows_marks_in_images_only_is_refused():
-    bag = Path(__file__).parents[2] / "bags/camera"
-    with pytest.raises(InputError, match="images on /stage/image are not played, and there are no "
-                       r"detections; selfcal detect .*bags/camera -o FOUND_BAG"):
-        Playlist(bag)
+def test_of_a_bag_without_detections_images_are_played():
+    playlist = Playlist(Path(__file__).parents[2] / "bags/camera")
+    assert (playlist.transport, playlist.counts["stage/image"], playlist.lost) == ("raw", 100, [])
 
 
 def test_images_beside_detections_are_said_not_to_be_played(tmp_path, events):
@@ -103,6 +100,6 @@ def test_images_beside_detections_are_said_not_to_be_played(tmp_path, events):
         writer.write("/stage/image", from_model.image(
             np.zeros((2, 2), np.uint8), "mono8", 10**9, "camera"), 10**9)
     playlist = Playlist(tmp_path / "bag")
-    assert len(playlist) == len(events)
+    assert len(playlist) == len(events) and playlist.transport == ""
     [line] = playlist.lost
     assert line.startswith("images on /stage/image are not played: selfcal detect ")

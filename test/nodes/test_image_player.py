@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag of images played into mark_detector, collector and solver: the map of detect and solve."""
 
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +11,13 @@ from rclpy.serialization import deserialize_message
 
 from selfcal_ros.bagio.offline import Playlist, collect_bag
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.files import read_json, read_yaml
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
@@ -85,7 +90,7 @@ def test_nothing_is_played_without_a_detector(graph):
 
 
 def test_images_are_played_at_their_times_among_the_other_messages():
-    playlist = Playlist(BAG, with_images=True)
+    playlist = Playlist(BAG)
     messages = list(playlist)
     assert len(messages) == len(playlist) == sum(playlist.counts.values())
     assert playlist.counts["stage/image"] == 100 and playlist.lost == []
@@ -102,6 +107,71 @@ def test_detections_are_played_rather_than_images(found, tmp_path):
     both.mkdir()
     for bag, name in ((BAG, "a"), (found, "b")):
         (both / f"{name}.mcap").write_bytes(next(Path(bag).glob("*.mcap")).read_bytes())
-    playlist = Playlist(both, with_images=True)
+    playlist = Playlist(both)
     assert "stage/image" not in playlist.counts and playlist.counts["stage/mark_detections"] == 676
     assert "images on /stage/image are not played" in playlist.lost[-1]
+
+
+PARAMS = """
+/**/mark_detector: {ros__parameters: {pixel_size: 5.0e-6, mark_size: 7.2e-5, turn: 1.5}}
+/**/measurement_collector: {ros__parameters: {outlier_limit: 7.0}}
+"""
+
+
+def test_replay_gives_the_result_of_detect_and_solve_bit_for_bit(ros_environment, found, tmp_path):
+    """Options win over the parameter file: one pixel size in it is wrong."""
+    params, replayed, solved = (tmp_path / name for name in ("p.yaml", "replayed", "solved"))
+    params.write_text(PARAMS)
+    common = ["--params", str(params), "--quiet", "-o"]
+    assert main(["replay", str(BAG), "--fast", "--shuffle", "3", "--pixel-size", "6e-6", *common,
+                 str(replayed)]) == 0
+    assert main(["solve", str(found), *common, str(solved)]) == 0
+    replayed, solved = read_json(replayed), read_json(solved)
+    assert replayed.pop("input")["file"] == "camera" != solved.pop("input")["file"]
+    for result in (replayed, solved):
+        result["provenance"].pop("created")
+    assert replayed == solved
+
+
+def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path):
+    """How images reach it is not what the file says of a live cell."""
+    rewritten(BAG, tmp_path / "bag", compressed, "cell2/")
+    params, started = tmp_path / "p.yaml", {}
+    params.write_text("mark_detector: {ros__parameters: {pixel_size: 6.0e-6, mark_size: 7.2e-5, "
+                      "max_waiting: 1, autostart: false, max_blur: 0.2}}")
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        started[module.removeprefix("selfcal_ros.nodes.")] = given
+        if module.endswith("mark_detector"):
+            started["file"] = read_yaml(given[given.index("--params-file") + 1])
+        yield SimpleNamespace(stdout=[], wait=lambda: 4)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert main(["replay", str(tmp_path / "bag"), "--namespace", "cell2", "--params", str(params),
+                 "--turn", "1.5", "--mirror"]) == 4
+    values = started["file"]["mark_detector"]["ros__parameters"]
+    assert values == DetectorSettings.checked(values, "test").__dict__
+    told = {"pixel_size": 6e-6, "mark_size": 7.2e-5, "turn": 1.5, "mirror": True, "max_blur": 0.2,
+            "transport": "compressed", "max_waiting": 32, "autostart": True}
+    assert {name: values[name] for name in told} == told
+    assert list(started) == ["mark_detector", "file", *replay_verb.NODES, "replay_session"]
+
+
+@pytest.mark.parametrize(("options", "problem"), [
+    ([], "has images and no detections: options: pixel_size and mark_size: are not set; give them "
+     "in m; `selfcal camera init` finds the size of a pixel"),
+    (["--pixel-size", "6e-6"], "has images and no detections: options: mark_size: is not set; give "
+     "it in m"),
+    (["--pixel-size", "6e-6", "--mark-size", "7.2e-6"], "options: mark_size: 1.2 pixels; a mark "
+     "has 6 to 2000 pixels")])
+def test_replay_of_images_says_which_options_are_missing(options, problem, capsys):
+    assert main(["replay", str(BAG), *options]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"selfcal replay: {BAG} ") and problem in line
+
+
+def test_options_for_images_are_refused_where_none_are_played(found, capsys):
+    assert main(["replay", str(found), "--mark-size", "7.2e-5"]) == 2
+    assert capsys.readouterr().err == (
+        f"selfcal replay: --mark-size: no images of {found} are played; leave it out; it is for "
+        "bags with images and no detections\n")

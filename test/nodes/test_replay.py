@@ -229,8 +229,9 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
         told.append(text)
         solver.publish(String(data=text))
     tell("of three views")
-    player = SimpleNamespace(unheard=list, step=lambda: None, played=1, total=1, done=True,
-                             sent={}, heard={}, playlist=SimpleNamespace(lost=[]))
+    player = SimpleNamespace(listener="", unheard=list, detector="", unseen=list, done=True,
+                             step=lambda: None, played=1, total=1, arrived=True,
+                             playlist=SimpleNamespace(lost=[]))
     session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
     graph.hand.create_timer(0.005, lambda: turns.append(session._digest))
     graph.until(lambda: turns.count("of all views") > 20, "the session to wait for the solver")

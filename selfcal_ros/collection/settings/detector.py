@@ -7,6 +7,9 @@ from typing import ClassVar
 from selfcal_ros.collection.settings.parameter import ManagedSettings, declared
 
 MARKS = ("disc", "ring", "cross", "corner")
+OPTIONS = {name: name for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity",
+                                   "turn", "mirror")}
+"""Options of commands that look for marks -> names of parameters."""
 
 
 @dataclass(frozen=True)

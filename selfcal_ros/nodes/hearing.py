@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which publishers a node hears, and how reliably: those of others do not count."""
+
+from collections.abc import Mapping
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
+
+
+def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[str]:
+    """Return the topics that the node named `by` does not hear reliably, with the reason if known.
+
+    Parameters
+    ----------
+    node : Node
+        Node of the publishers.
+    publishers : mapping
+        Topic -> publisher.
+    by : str
+        Name of the listening node with its namespace.
+    """
+    found = {topic: _reliabilities(node, publisher, by) for topic, publisher in publishers.items()}
+    return [topic + (" reliably (another publisher offers best effort)" if heard else "")
+            for topic, heard in found.items() if ReliabilityPolicy.RELIABLE not in heard]
+
+
+def _reliabilities(node: Node, publisher: Publisher, by: str) -> list[ReliabilityPolicy]:
+    """Return the reliabilities requested by the subscriptions of a node to a publisher."""
+    if not publisher.get_subscription_count():
+        return []
+    return [reader.qos_profile.reliability
+            for reader in node.get_subscriptions_info_by_topic(publisher.topic_name)
+            if by == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
