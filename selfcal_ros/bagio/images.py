@@ -36,6 +36,8 @@ COLUMNS = ("file", "view", "x", "y")
 """Columns of a table of positions: image file, name of the view, indicated position, m. Without a
 plan the view is not needed."""
 FARTHEST_M = 10.0
+FAR = 30
+"""Median distance of positions, over that of the plate's edge, which shows another unit than m."""
 START_NS = 1_700_000_000 * NS_PER_S
 """Stamp of the first command: the times of the exposures are not known."""
 STEP_NS = NS_PER_S
@@ -61,18 +63,25 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     Raises
     ------
     InputError
-        For another heading, a view that the plan does not have, or a position that is none.
+        For another heading, a view that the plan does not have, a file that comes twice, a
+        position that is none, or positions far from the plate of the plan.
+    NoDataError
+        If there are no rows.
     """
+    text = read_text(path).removeprefix("\ufeff")  # spreadsheets begin with it
     lines = [(f"{path}:{number}", line) for number, line in enumerate(
-        read_text(path).splitlines(), 1) if line.strip() and not line.startswith("#")]
+        text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     heading = csv_cells(lines[0][1], lines[0][0]) if lines else []
     columns = COLUMNS if plan else [column for column in COLUMNS if column != "view"]
     for column in columns:
         if column not in heading:
             raise InputError(str(path), f"no column '{column}'",
                              f"begin with the line {','.join(columns)}")
+    if len(lines) == 1:
+        raise NoDataError(str(path), "no row below the heading", "give one for each image")
     names = [view.name for view in plan.views] if plan else [""]
-    rows = []
+    rows: list[Position] = []
+    first: dict[str, str] = {}
     for where, line in lines[1:]:
         cells = dict(zip(heading, csv_cells(line, where), strict=False))
         if not all(cells.get(column) for column in columns):
@@ -80,9 +89,25 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
         view = cells["view"] if plan else ""
         if view not in names:
             raise InputError(where, f"the plan has no view '{view}'", known_are(view, names))
+        if first.setdefault(cells["file"], where) != where:
+            raise InputError(where, f"{cells['file']} is in line "
+                             f"{first[cells['file']].rpartition(':')[2]} as well",
+                             "give each image once; a repeated mark is another image")
         rows.append(Position(where, cells["file"], names.index(view),
                              _metres(cells["x"], where), _metres(cells["y"], where)))
+    if plan:
+        _check_unit(str(path), rows, plan)
     return sorted(rows, key=lambda row: row.view)
+
+
+def _check_unit(path: str, rows: list[Position], plan: Plan) -> None:
+    """Refuse positions in another unit: most of them far from the plate in any of its views."""
+    edge_m = plan.artifact.grid_pitch_m * math.hypot(*plan.artifact.reach) + max(
+        math.hypot(*view.translation_m) for view in plan.views)
+    typical_m = float(np.median([math.hypot(row.x_m, row.y_m) for row in rows]))
+    if typical_m > FAR * edge_m:
+        raise InputError(path, f"half of the positions are over {typical_m:.3g} m from the origin, "
+                         f"the marks of the plan within {edge_m:.3g} m", "give x and y in m")
 
 
 def _metres(text: str, where: str) -> float:

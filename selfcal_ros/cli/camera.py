@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
               "and are left out", file=sys.stderr)
     found = camera_pose(positions, images, Sense(args.sense))
+    _check_size(found, args)
     values = {"pixel_size": found.pixel_size_m, "turn": math.degrees(found.turn_rad),
               "mirror": found.mirror, "mark": args.mark, "mark_size": args.mark_size,
               "polarity": args.polarity}
@@ -65,8 +66,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _text(found: "CameraPose", output: str) -> str:
+def _check_size(found: "CameraPose", args: argparse.Namespace) -> None:
+    """Refuse a camera in which marks would have another size than stated."""
+    told = args.mark_size / args.mark_pixels
+    if abs(args.mark_size / found.pixel_size_m / args.mark_pixels - 1) > (
+            DetectorSettings().size_tolerance):
+        raise InputError(args.positions or args.bag, "by the moves of the stage a pixel has "
+                         f"{found.pixel_size_m / M_PER_UM:.3g} µm, by --mark-size over "
+                         f"--mark-pixels {told / M_PER_UM:.3g} µm",
+                         "correct the positions (m), --mark-size (m) or --mark-pixels")
 
+
+def _text(found: "CameraPose", output: str) -> str:
     return (f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
             f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
             f"(u {math.degrees(found.u_turn_rad):.1g}°), "

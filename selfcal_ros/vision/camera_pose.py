@@ -11,6 +11,8 @@ from selfcal_ros.model.readings import Sense
 
 NOT_SIMILAR = 0.02
 """Relative difference of the two axes, or shear, above which a camera is refused."""
+TOO_UNCERTAIN = 0.02
+"""Relative standard uncertainty of the size of a pixel above which a camera is refused."""
 LEAST_SPAN = 0.1
 """Smallest extent of the positions over the largest one."""
 
@@ -90,7 +92,8 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
     NoDataError
         If too few marks were followed.
     InputError
-        If the stage moved along one line, or the image is no similar image of the motion.
+        If the stage moved along one line, the marks do not follow it, or the image is no similar
+        image of the motion.
     """
     number = np.concatenate([np.zeros(0, int), *tracks(images)])
     stage = np.repeat(positions, [len(found) for found in images], axis=0)
@@ -100,7 +103,7 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
     _, number = np.unique(number, return_inverse=True)
     count = number.max(initial=-1) + 1
     if len(number) < count + 3:
-        raise NoDataError("camera", f"{len(number)} readings of {count} marks that were followed",
+        raise NoDataError("images", f"{len(number)} readings of {count} marks that were followed",
                           "move the stage in x and y by less than half the distance of two marks, "
                           "so that marks stay in the image")
     stage = stage - (np.stack([np.bincount(number, axis) for axis in stage.T])
@@ -109,7 +112,7 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
                      / np.bincount(number)).T[number]
     span = np.linalg.svd(stage, compute_uv=False)
     if span[1] < LEAST_SPAN * span[0]:
-        raise InputError("camera", "the stage moved along one line only",
+        raise InputError("images", "the stage moved along one line only",
                          "move it in x and in y")
     by_stage = np.linalg.lstsq(stage, place, rcond=None)[0].T  # px per m
     residual = place - stage @ by_stage.T
@@ -144,9 +147,14 @@ def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: 
         differ[1] = np.remainder(differ[1] + np.pi, 2 * np.pi) - np.pi
         jacobian[:, index] = differ / (2 * step)
     u = np.sqrt(np.diagonal(jacobian @ covariance @ jacobian.T))
+    if not u[0] <= TOO_UNCERTAIN * found[0]:
+        raise InputError("images", "the marks do not follow the stage: the size of a pixel has a "
+                         f"standard uncertainty of {u[0] / found[0]:.2g} of itself",
+                         "move the stage from image to image by less than half the distance of "
+                         "two marks, and check the positions")
     sheared = float(np.hypot(*found[2:]))
     if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
-        raise InputError("camera", f"the image of the motion is sheared by {sheared:.1%}",
+        raise InputError("images", f"the image of the motion is sheared by {sheared:.1%}",
                          "check that the moves are shorter than half the distance of two marks, "
                          "and that the encoder axes are those of the camera's stage")
     return CameraPose(float(found[0]), float(u[0]), float(found[1]), float(u[1]), mirror, sheared,

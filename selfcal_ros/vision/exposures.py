@@ -75,16 +75,16 @@ class ImageDetector:
             If the image cannot be used, which is counted: unknown encoding, damaged, another size,
             the stamp of an image before.
         """
-        return self._detect(lambda: picture_of(message), stamp_ns(message))
+        return self._detect(lambda: picture_of(message), stamp_ns(message), "image")
 
     def take_file(self, data: bytes, name: str, stamp: int) -> list[Detection]:
         """Return the detections of an image file exposed at `stamp`, ns; raises like `take`."""
-        return self._detect(lambda: decoded(data, name), stamp)
+        return self._detect(lambda: decoded(data, name), stamp, name)
 
-    def _detect(self, decode: Callable[[], Picture], stamp: int) -> list[Detection]:
+    def _detect(self, decode: Callable[[], Picture], stamp: int, name: str) -> list[Detection]:
         try:
             picture = decode()
-            self._check(stamp, picture)
+            self._check(stamp, picture, name)
         except InputError:
             self.counts.refused += 1
             raise
@@ -98,19 +98,19 @@ class ImageDetector:
         self.counts.rejected.update(rejected)
         return found
 
-    def _check(self, stamp: int, picture: Picture) -> None:
+    def _check(self, stamp: int, picture: Picture, name: str) -> None:
         """Refuse a repeated image, and one of another size, whose centre is not the axis.
 
         Stamps need not ascend: a single one in the future, or a clock that was set back, spoils no
         other image. Which of them count, the collector judges.
         """
         if stamp in self._stamps:
-            raise InputError("image", "its stamp is that of an image before",
+            raise InputError(name, "its stamp is that of an image before",
                              "stamp each exposure by its own instant")
         shape = picture.values.shape
         if not self._size.agrees(shape):
             old, new = (f"{size[1]} x {size[0]}" for size in (self._size.shape, shape))
-            raise InputError("image", f"{new} pixels, but the images before have {old}",
+            raise InputError(name, f"{new} pixels, but the images before have {old}",
                              "record images of one size; the optical axis is their centre")
 
 

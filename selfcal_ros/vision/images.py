@@ -10,7 +10,7 @@ from collections.abc import Buffer
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from selfcal_ros.errors import InputError, first_line
 
@@ -75,6 +75,8 @@ def decoded(data: Buffer, where: str) -> Picture:
                 if picture.width * picture.height > LARGEST:
                     raise ValueError(f"{picture.width} x {picture.height} pixels")
                 return _values(picture)
+    except UnidentifiedImageError as error:  # its text has the address of an object
+        raise InputError(where, "not an image, or damaged", "give PNG, JPEG or TIFF") from error
     except Exception as error:  # the decoders of Pillow raise many kinds
         raise InputError(where, f"cannot be decoded as an image ({first_line(error)[:80]})",
                          "give PNG, JPEG or TIFF") from error

@@ -115,6 +115,36 @@ def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "nodes.yaml").exists()
 
 
+def test_moves_by_a_whole_pitch_are_refused(tmp_path, capsys, monkeypatch):
+    """Each image looks like the one before: what a calibration's images show."""
+    moves = [(x * 2e-4, y * 2e-4) for x in range(3) for y in range(3)]
+    monkeypatch.setattr(f"{__name__}.MOVES", moves)
+    monkeypatch.setattr(f"{__name__}.views", lambda camera, sign: [camera.image(
+        MARKS, np.random.default_rng(number)) for number in range(len(moves))])
+    bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
+    assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "the marks do not follow the stage" in line and "less than half the distance" in line
+    assert not (tmp_path / "nodes.yaml").exists()
+
+
+@pytest.mark.parametrize(("factor", "options", "by_moves", "by_mark"), [
+    (1e3, [], "2.6e+03", "2.63"), (1.0, ["--mark-size", "50"], "2.6", "2.63e+06")])
+def test_positions_or_marks_in_other_units_are_refused(tmp_path, capsys, factor, options, by_moves,
+                                                       by_mark):
+    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
+    rows = ["file,x,y"]
+    for number, (move, values) in enumerate(zip(MOVES, views(camera), strict=True)):
+        Image.fromarray(values).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,{factor * move[0]},{factor * move[1]}")
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"),
+                *options) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"a pixel has {by_moves} µm, by --mark-size over --mark-pixels {by_mark} µm; " in line
+    assert not (tmp_path / "b.yaml").exists()
+
+
 def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
     """The encoder of y counts half: the image of the motion is no similar one."""
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
@@ -127,13 +157,14 @@ def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
     assert "the image of the motion is sheared by 33" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("count, code", [(0, 4), (1, 4)])
-def test_too_few_images_are_said_so(tmp_path, capsys, count, code):
+@pytest.mark.parametrize("count, problem", [
+    (0, "no row below the heading"), (1, "move the stage in x and y")])
+def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
     rows = ["file,x,y"]
     for number in range(count):
         Image.fromarray(views(camera)[0]).save(tmp_path / f"{number}.png")
         rows.append(f"{number}.png,0,0")
     (tmp_path / "p.csv").write_text("\n".join(rows) + "\n")
-    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == code
-    assert "move the stage in x and y" in capsys.readouterr().err
+    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 4
+    assert problem in capsys.readouterr().err

@@ -260,7 +260,12 @@ def own_values(data):
     ("file,view,x,y\na.png,tilted,0,0\n", ":2: the plan has no view 'tilted'"),
     ("file,view,x,y\n\na.png,shift,0,far\n", ":3: 'far' is no position"),
     ("file,view,x,y\na.png,shift,nan,0\n", ":2: 'nan' is no position"),
-    ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell")])
+    ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell"),
+    ("\ufefffile,view,x,y\r\na.png,,0,0\r\n", ":2: an empty cell"),
+    ("file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n", ":4: a.png is in line 2 as well"),
+    ("file,view,x,y\na.png,shift,9,9\nb.png,shift,0,-1.2\nc.png,shift,0,0\n", "p.csv: half of "
+     "the positions are over 1.2 m from the origin, the marks of the plan within 0.0383 m; give x "
+     "and y in m")])
 def test_a_bad_table_is_refused_with_its_line(tmp_path, capsys, table, problem):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
     (tmp_path / "p.csv").write_text(table)
@@ -270,16 +275,30 @@ def test_a_bad_table_is_refused_with_its_line(tmp_path, capsys, table, problem):
     assert not (tmp_path / "found").exists()
 
 
+def test_a_table_without_rows_is_no_data(tmp_path, capsys):
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
+    (tmp_path / "p.csv").write_text("file,view,x,y\n")
+    assert detect(tmp_path, tmp_path / "found", "--positions", str(tmp_path / "p.csv"), "--plan",
+                  str(tmp_path / "plan.yaml")) == 4
+    assert "p.csv: no row below the heading; give one for each image" in capsys.readouterr().err
+    assert not (tmp_path / "found").exists()
+
+
 def test_missing_and_damaged_files_are_one_line_each(tmp_path, capsys):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
-    (tmp_path / "p.csv").write_text("# by hand\nfile,view,x,y\na.png,shift,0,0\nb.png,shift,0,0\n")
+    (tmp_path / "p.csv").write_text("# by hand\nfile,view,x,y\n" + "".join(
+        f"{name}.png,shift,0,0\n" for name in "abcd"))
     (tmp_path / "a.png").write_bytes(b"no image")
+    for name, height in (("c", 60), ("d", 50)):
+        Image.fromarray(np.zeros((height, 60), np.uint8)).save(tmp_path / f"{name}.png")
     assert detect(tmp_path, tmp_path / "found", "--positions", str(tmp_path / "p.csv"), "--plan",
                   str(tmp_path / "plan.yaml")) == 0
     printed = capsys.readouterr()
-    assert len(printed.err.splitlines()) == 2
-    assert "a.png: cannot be decoded as an image" in printed.err
-    assert "b.png" in printed.err and "0 marks in 0 images" in printed.out
+    damaged, missing, other_size = printed.err.splitlines()
+    assert "a.png: not an image, or damaged; give PNG, JPEG or TIFF" in damaged
+    assert "b.png: no such file" in missing
+    assert "d.png: 60 x 50 pixels, but the images before have 60 x 60" in other_size
+    assert "0 marks in 1 images" in printed.out
 
 
 def test_positions_without_a_plan_are_refused(bag, tmp_path, capsys):

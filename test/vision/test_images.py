@@ -67,5 +67,5 @@ def test_impossible_images_are_refused(wrong, problem):
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(50)])
 def test_what_cannot_be_decoded_is_refused(data):
-    with pytest.raises(InputError, match=r"^f\.png: cannot be decoded as an image"):
+    with pytest.raises(InputError, match=r"^f\.png: not an image, or damaged; give PNG"):
         decoded(data, "f.png")
