@@ -27,14 +27,14 @@ def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> 
     parser.add_argument("--json", action="store_true", help=f"print {what} (docs/json.md)")
 
 
-def add_parameters(parser: argparse.ArgumentParser, kind: type[Settings],
+def add_parameters(parser: argparse._ActionsContainer, kind: type[Settings],
                    options: Mapping[str, str]) -> None:
     """Add options for parameters of a node, None if not given.
 
     Parameters
     ----------
-    parser : argparse.ArgumentParser
-        The parser of the verb.
+    parser : argparse.ArgumentParser or group of arguments
+        The parser of the verb, or a part of it.
     kind : type of Settings
         The parameters of the node.
     options : mapping

@@ -111,8 +111,8 @@ def test_a_parameter_file_that_is_not_there_starts_nothing(run, tmp_path, file):
 
 
 @pytest.mark.parametrize(("file", "argument", "problem"), [
-    ("calibrate", "compensate:=2", "\"compensate\" provided value \"2\" is not valid"),
-    ("calibrate", "detect:=maybe", "\"detect\" provided value \"maybe\" is not valid"),
+    ("calibrate", "compensate:=2", '"compensate" provided value "2" is not valid'),
+    ("calibrate", "detect:=maybe", '"detect" provided value "maybe" is not valid'),
     ("replay", "rate:=fast", "rate:=fast: not a number; give the speed")])
 def test_a_wrong_value_starts_nothing(run, file, argument, problem):
     """Nodes that it had started would go on without the launch; `run` waits for their end."""
