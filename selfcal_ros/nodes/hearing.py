@@ -5,7 +5,8 @@ from collections.abc import Mapping
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
 def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[str]:
@@ -25,10 +26,34 @@ def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[
             for topic, heard in found.items() if ReliabilityPolicy.RELIABLE not in heard]
 
 
+def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
+    """Return whether the node named `by` will hear the messages that a third node publishes.
+
+    Parameters
+    ----------
+    node : Node
+        A node that sees all subscriptions.
+    topic : str
+        The topic.
+    by : str
+        Name of the listening node with its namespace.
+    matched : int
+        Number of subscriptions to which the publisher is connected.
+    """
+    readers = [reader for reader in node.get_subscriptions_info_by_topic(
+        node.resolve_topic_name(topic))
+        if reader.qos_profile.durability == DurabilityPolicy.VOLATILE]  # others never match
+    return matched >= len(readers) and by in [_name(reader) for reader in readers]
+
+
+def _name(reader: TopicEndpointInfo) -> str:
+    return f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"
+
+
 def _reliabilities(node: Node, publisher: Publisher, by: str) -> list[ReliabilityPolicy]:
     """Return the reliabilities requested by the subscriptions of a node to a publisher."""
     if not publisher.get_subscription_count():
         return []
     return [reader.qos_profile.reliability
             for reader in node.get_subscriptions_info_by_topic(publisher.topic_name)
-            if by == f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"]
+            if by == _name(reader)]

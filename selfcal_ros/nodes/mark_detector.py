@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message
 
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import WhileConfigured
 from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode
@@ -33,9 +34,9 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
 
     def configure(self) -> None:
         """Create the session and the publisher."""
-        self._output = self.output(names.DETECTIONS)
+        self._detections = self.publisher(names.DETECTIONS)
         self._received = self.publisher(names.private(names.RECEIVED))
-        self._taken = self._found = 0
+        self._taken = self._found = self._matched = 0
         self.session = DetectingSession(self.settings, self.ports(self._publish))
 
     def activate(self) -> None:
@@ -50,7 +51,7 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         self._tell_taken()
 
     def _publish(self, _output: str, fields: dict[str, Any]) -> None:
-        self._output(fields)
+        self._detections.publish(fill(names.DETECTIONS.type(), fields))
         self._found += 1
 
     def _take(self, data: bytes, _received_ns: int) -> None:
@@ -61,17 +62,19 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
             self._tell_taken()
 
     def _tell_taken(self) -> None:
-        self._received.publish(names.RECEIVED.type(data=[self._taken, self._found]))
+        self._matched = self._detections.get_subscription_count()
+        self._received.publish(names.RECEIVED.type(
+            data=[self._taken, self._found, self._matched]))
 
     def _look(self) -> None:
         """Take a few waiting images, and count the lost ones by their numbers."""
+        if self._matched != self._detections.get_subscription_count():
+            self._tell_taken()
         if self._input.subscription is not None:
             self._empty(self._input.subscription, self._input.callback, FEW)
 
     def _deliver(self) -> None:
-        for publisher in self.publishers:
-            if publisher.topic_name == self.resolve_topic_name(names.DETECTIONS.name):
-                publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+        self._detections.wait_for_all_acked(Duration(seconds=PATIENCE_S))
 
 
 def main() -> None:

@@ -70,7 +70,7 @@ CORRECTED_MOTION = Topic(topics.CORRECTED_MOTION_TOPIC, JointState, _qos(1000))
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
 RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
 """The collector's counts of encoder samples, detections and commands, or the detector's of images
-taken and detections published, for a player's pace."""
+taken, detections published and subscriptions connected to these, for a player's pace."""
 SOLVED = Topic("solved", String, _qos(1, latched=True))
 """The solver's fingerprint of the readings behind its results."""
 

@@ -15,7 +15,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.hearing import not_heard
+from selfcal_ros.nodes.hearing import hears, not_heard
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS
 from selfcal_ros.units import S_PER_NS
 
@@ -54,8 +54,7 @@ class Player:
         if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
         self._messages = iter(self.playlist)
-        first = next(self._messages)
-        self._next: tuple[str, int, bytes] | None = first
+        self._next: tuple[str, int, bytes] | None = (first := next(self._messages))
         self._first_ns = first[1]
         transport = self.playlist.transport
         images = names.image_topics(transport, IMAGE_DEPTH)[:1] if transport else []
@@ -71,7 +70,6 @@ class Player:
         received = names.of_node(self.listener, names.RECEIVED)
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
-        self._has_images = bool(images)
         if images:
             taken = names.of_node(self.detector, names.RECEIVED)
             self._detector_tells = partial(node.count_publishers, taken.name)
@@ -79,8 +77,7 @@ class Player:
 
     taken: int | None = None
     """Images that the detector has taken."""
-    found = 0
-    """Detections that it has published."""
+    found = matched = 0  # detections that it has published, and subscribers matched to them
     _taken_before = 0
 
     @property
@@ -106,6 +103,9 @@ class Player:
         """
         played = [topic for topic in self.playlist.counts if topic in KINDS]
         waits = self.heard is None and self._tells()
+        if played and self.taken is not None and not hears(
+                self.node, DETECTION_TOPIC, self.listener, matched=self.matched):
+            return [DETECTION_TOPIC]  # it would lose those of the first images
         return played if waits else self._not_heard(played, self.listener)
 
     def unseen(self) -> list[str]:
@@ -120,7 +120,7 @@ class Player:
     @property
     def arrived(self) -> bool:
         """Whether the nodes have received everything sent, and the detections in its images."""
-        if not self._has_images:
+        if IMAGES not in self.sent:
             return self.heard == self.sent
         return self.taken == self.sent[IMAGES] and self.heard == {
             KINDS[topic]: self.found if topic == DETECTION_TOPIC else self.sent[KINDS[topic]]
@@ -187,9 +187,9 @@ class Player:
             self._before = self._received - self._at + self.sent.get(IMAGES, 0)
 
     def _on_taken(self, message: Any) -> None:
-        if len(message.data) != len(("images", "detections")):
+        if len(message.data) != len(("taken", "found", "matched")):
             return
-        taken, self.found = map(int, message.data)
+        taken, self.found, self.matched = map(int, message.data)
         if taken < (self.taken or 0):  # a detector that was restarted
             self._taken_before = taken - self.sent[IMAGES]
         self.taken = taken

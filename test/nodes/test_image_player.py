@@ -175,3 +175,19 @@ def test_options_for_images_are_refused_where_none_are_played(found, capsys):
     assert capsys.readouterr().err == (
         f"selfcal replay: --mark-size: no images of {found} are played; leave it out; it is for "
         "bags with images and no detections\n")
+
+
+def test_no_image_is_played_before_the_detections_are_heard(graph, monkeypatch):
+    """The detector is connected to the collector last: detections until then would be lost."""
+    node = graph.node(MarkDetectorNode, **DETECTS)
+    count, connected = node._detections.get_subscription_count, []
+    monkeypatch.setattr(node._detections, "get_subscription_count",
+                        lambda: count() if connected else 0)
+    node._tell_taken()
+    graph.node(MeasurementCollector)
+    player = graph.node(BagPlayer, bag=str(BAG), rate=0.0)
+    graph.until(lambda: player.player.taken is not None and player.player.unheard() == [
+        names.DETECTIONS.name] and count(), "all but the connection")
+    assert player.player.played == 0
+    connected.append(True)
+    graph.until(lambda: player.player.played > 0, "the first message")

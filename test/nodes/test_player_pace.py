@@ -85,7 +85,7 @@ def test_images_are_sent_as_the_detector_takes_them(monkeypatch):
     played.sent = {IMAGES: 0}
     for taken, total in ((30, WAITING_IMAGES), (30, WAITING_IMAGES), (32, WAITING_IMAGES + 2),
                          (0, 2 * WAITING_IMAGES + 2), (3, 2 * WAITING_IMAGES + 5)):
-        played._on_taken(SimpleNamespace(data=[taken, 0]))
+        played._on_taken(SimpleNamespace(data=[taken, 0, 1]))
         played.step()
         assert len(sent) == total == played.sent[IMAGES]
 
@@ -93,10 +93,10 @@ def test_images_are_sent_as_the_detector_takes_them(monkeypatch):
 def test_all_has_arrived_once_the_detections_of_all_images_have():
     """Two images, with five marks: the detector tells of them, the collector of what it heard."""
     played = player_of(2, [], rate=0.0, topic="stage/image")
-    played.sent, played._has_images = {"encoder": 4, "command": 1, IMAGES: 2}, True
+    played.sent = {"encoder": 4, "command": 1, IMAGES: 2}
     arrived = []
-    for found, heard in (([1, 3], [4, 3, 1]), ([2, 5], [4, 3, 1]), ([2, 5], [4, 5, 0]),
-                         ([2, 5], [3, 5, 1]), ([2], [4, 5, 1]), ([1, 5], [4, 5, 1])):
+    for found, heard in (([1, 3, 1], [4, 3, 1]), ([2, 5, 1], [4, 3, 1]), ([2, 5, 1], [4, 5, 0]),
+                         ([2, 5, 1], [3, 5, 1]), ([2], [4, 5, 1]), ([1, 5, 1], [4, 5, 1])):
         played._on_taken(SimpleNamespace(data=found))
         played._on_received(SimpleNamespace(data=heard))
         arrived.append(played.arrived)
