@@ -217,14 +217,8 @@ def angular_variance(field: FieldCovariance, conditions: Conditions, *,
 
 def _inverse_diagonal(system: NormalEquations) -> np.ndarray:
     n = system.angular.n_lines
-    out = np.empty(n)
-    for start in range(0, n, BLOCK):
-        stop = min(start + BLOCK, n)
-        unit = np.zeros((n, stop - start))
-        unit[np.arange(start, stop), np.arange(stop - start)] = 1.0
-        out[start:stop] = system.angular.solve(unit)[np.arange(start, stop),
-                                                     np.arange(stop - start)]
-    return out
+    units = (np.eye(n, min(BLOCK, n - start), -start) for start in range(0, n, BLOCK))
+    return np.concatenate([(unit * system.angular.solve(unit)).sum(axis=0) for unit in units])
 
 
 def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,

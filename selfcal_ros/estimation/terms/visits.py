@@ -204,8 +204,9 @@ def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, i
         n = len(view.m)
         count = np.bincount(visits.mark, visits.count, n)
         for values in (visits.dx, visits.dy):
-            mean = np.bincount(visits.mark, visits.count * values, n) / np.maximum(count, 1)
-            total += float(visits.count @ (values - mean[visits.mark]) ** 2)
+            sums = np.bincount(visits.mark, visits.count * values, n)
+            mean = sums[visits.mark] / count[visits.mark]
+            total += float(visits.count @ (values - mean) ** 2)
         dof += 2 * (len(visits.mark) - int(np.count_nonzero(count)))
     if not repeated or dof < least_dof:
         return None

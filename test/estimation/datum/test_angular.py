@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.datum import angular
 from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
 from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.solve import prepare
@@ -60,6 +62,15 @@ def test_the_conditions_are_met_and_the_free_rotations_follow(sense):
                             rcond=None)[0]
     assert found.g_theta == pytest.approx(dense[:k], abs=1e-12)
     assert phi[3] == pytest.approx(dense[2 * k], abs=1e-12)
+
+
+def test_variances_do_not_depend_on_how_many_lines_are_computed_at_once(monkeypatch):
+    rng = np.random.default_rng(3)
+    readings = simulate_measurements(random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng,
+                                     sigma_m=1e-7, sigma_theta_rad=1e-5)
+    whole = calibrate(readings).error_map.u_g_theta
+    monkeypatch.setattr(angular, "BLOCK", 5)  # of 12
+    assert calibrate(readings).error_map.u_g_theta == pytest.approx(whole, rel=1e-12)
 
 
 def test_zero_mean_counts_the_known_lines_alone():
