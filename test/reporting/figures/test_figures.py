@@ -35,7 +35,6 @@ from selfcal_ros.reporting.figures.parts import (
     levels,
     ordinal,
     range_scale,
-    text_width,
 )
 from selfcal_ros.reporting.figures.places import plan_figure, rejected_in, rejected_map
 from selfcal_ros.reporting.figures.residuals import (
@@ -46,6 +45,7 @@ from selfcal_ros.reporting.figures.residuals import (
     residuals_in,
 )
 from selfcal_ros.reporting.report import inline_svg, svg_file
+from test.support.drawings import cut_off, words_on_words
 from test.support.results import chapters_of, known_result, with_residuals
 
 
@@ -77,46 +77,18 @@ RESULTS = {
 }
 
 
-def extent(item):
-    """Return the smallest and largest x and y of an item; words by a cautious width."""
-    if isinstance(item, Path):
-        points = [point for line in item.lines for point in line]
-    elif isinstance(item, Discs):
-        points = [(x + a * rx, y + a * ry) for (x, y), (rx, ry) in
-                  zip(item.centres, item.radii, strict=True) for a in (-1, 1)]
-    elif isinstance(item, Spot):
-        return extent(Discs((item.at,), ((0.0, 0.0),)))
-    else:
-        x, y = item.at
-        width = text_width(item.text, item.size) * 0.9
-        start = {"start": 0.0, "middle": 0.5, "end": 1.0}[item.anchor] * width
-        if item.turned:
-            return x - item.size, x, y + start - width, y + start
-        return x - start, x - start + width, y - 0.8 * item.size, y + 0.25 * item.size
-    return (min(p[0] for p in points), max(p[0] for p in points),
-            min(p[1] for p in points), max(p[1] for p in points))
-
-
 @pytest.mark.parametrize("name", RESULTS)
 def test_nothing_lies_outside_of_a_figure(name):
     figures = drawn(RESULTS[name]())
     assert len(figures) >= 3
     for drawing in figures:
-        for item in drawing.items:
-            left, right, top, bottom = extent(item)
-            assert left >= -0.5 and right <= drawing.width + 0.5, (drawing.name, item)
-            assert top >= -0.5 and bottom <= drawing.height + 0.5, (drawing.name, item)
+        assert cut_off(drawing) == [], drawing.name
 
 
 @pytest.mark.parametrize("name", RESULTS)
 def test_words_do_not_lie_on_each_other(name):
     for drawing in drawn(RESULTS[name]()):
-        boxes = [(item.text, extent(item)) for item in drawing.items if isinstance(item, Label)]
-        for number, (text, (left, right, top, bottom)) in enumerate(boxes):
-            for other, (a, b, c, d) in boxes[number + 1:]:
-                across = min(right, b) - max(left, a)
-                down = min(bottom, d) - max(top, c)
-                assert across < 3 or down < 3, (drawing.name, text, other)
+        assert words_on_words(drawing) == [], drawing.name
 
 
 def shafts(drawing, colour="ink", width=1.2):
@@ -390,6 +362,18 @@ def test_rejected_readings_stand_where_they_happened():
     assert (x, y) == pytest.approx((0.0, 10.0), abs=1e-9)
     words = [i.text for i in rejected_map(result).items if isinstance(i, Label)]
     assert "low score (1)" in words and "outlier among views (1)" in words
+
+
+def test_readings_rejected_far_away_stand_at_the_edge_of_their_panel():
+    result = with_residuals(9, 8, size_y=5)
+    far = [{"view": result.views[0].name, "reason": ["low_score"] * 2,
+            "x": [1.0, -1.0], "y": [1.0, -1.0]}]
+    drawing = rejected_map(replace(result, extra={"rejected_at": far}))
+    (left, top), _, (right, bottom), *_ = next(
+        item.lines[0] for item in drawing.items if isinstance(item, Path) and item.stroke == "soft"
+        and len(item.lines[0]) == 5)
+    dots = next(item for item in drawing.items if isinstance(item, Discs))
+    assert np.ravel(dots.centres) == pytest.approx([right, top, left, bottom])
 
 
 @pytest.mark.parametrize("extra", [

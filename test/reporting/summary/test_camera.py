@@ -36,7 +36,11 @@ def test_the_summary_states_the_camera():
     facts = dict(camera_facts(result()))
     assert facts["scale"].startswith("-0.39")
     assert facts["distortion"] == "radial (cubic)"
-    assert facts["largest error"].endswith("mm of the image")
+    worst = max(result().extra["camera"]["cells"], key=lambda c: np.hypot(c["dx"], c["dy"]))
+    assert facts["largest error"].startswith(
+        f"{significant(1e6 * np.hypot(worst['dx'], worst['dy']))} ± ")
+    assert facts["largest error"].endswith(
+        f" at x {worst['x'] * 1e3:.4g} mm, y {worst['y'] * 1e3:.4g} mm of the image")
     assert "Camera" in summary_text(result())
     words = {line.split("  ")[1]: line for line in summary_text(result()).splitlines()
              if line.startswith("  ")}
@@ -80,8 +84,17 @@ def test_the_report_draws_the_yaw():
     assert len(spots) == 25
     assert spots[7].title.startswith(f"x {yaw['x'][7] * 1e3:.4g} mm, y {yaw['y'][7] * 1e3:.4g} mm")
     assert f": {significant(yaw['yaw'][7] * 1e6)} ±" in spots[7].title
-    fills = [item.fill for item in drawing.items if getattr(item, "fill", "").startswith("d")]
-    assert len(fills) > 5
+    fields = [item for item in drawing.items if getattr(item, "fill", "").startswith("d")
+              and len(item.lines[0]) == 4]  # those of the scale are closed
+    assert len({item.fill for item in fields}) > 5
+    corners = np.concatenate([item.lines for item in fields])
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    (left, top), _, (right, bottom), *_ = next(
+        item.lines[0] for item in drawing.items if getattr(item, "stroke", "") == "soft"
+        and len(item.lines[0]) == 5)
+    assert len(corners) == 25  # 5 x 5 fields that fill the frame
+    assert high - low == pytest.approx(np.tile([right - left, bottom - top], (25, 1)) / 5)
+    assert low.min(axis=0) == pytest.approx([left, top])
 
 
 @pytest.mark.parametrize("yaw", [None, [], {"x": [1.0]}, {
@@ -93,8 +106,12 @@ def test_without_a_yaw_none_is_shown(yaw):
 
 
 @pytest.mark.parametrize("camera", [None, {}, {"cells": []}, {"cells": [{"x": 1}]}, [1], {
-    "cells": [dict.fromkeys(("x", "y", "dx", "dy", "u_dx", "u_dy"), "far")]}])
+    "cells": [dict.fromkeys(("x", "y", "dx", "dy", "u_dx", "u_dy"), "far")]}, "infinite"])
 def test_without_a_camera_nothing_is_shown(camera):
+    if camera == "infinite":  # but not everywhere
+        known = result().extra["camera"]
+        first, *others = known["cells"]
+        camera = {**known, "cells": [{**first, "dx": np.inf}, *others], "yaw": None}
     extra = {**result().extra, "camera": camera}
     other = replace(result(), extra=extra)
     assert cells_of(other).shape == (6, 0)

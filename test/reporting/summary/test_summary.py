@@ -315,7 +315,8 @@ def test_summary_is_the_same_after_a_round_trip_through_json():
 @pytest.mark.parametrize(("value", "text"), [
     (0.5806, "0.581"), (12.345, "12.3"), (1234.5, "1234"), (0, "0"), (-0.0099996, "-0.0100"),
     (1e-12, "1.00e-12"), (2.5e7, "2.50e+07"), (float("nan"), "–"), (float("inf"), "–"),
-    (9.996, "10.0"), (999.6, "1000"),
+    (9.996, "10.0"), (999.6, "1000"), (1.234e-4, "0.000123"), (1.234e-5, "1.23e-05"),
+    (1234567.0, "1234567"), (12345678.0, "1.23e+07"),
 ])
 def test_significant_digits(value, text):
     assert significant(value) == text
