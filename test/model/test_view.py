@@ -280,6 +280,7 @@ def test_the_cells_of_an_image_are_views_at_shifted_poses():
     assert [view.plan_view for view in views] == ["a"] * 3 + ["turned"] * 3
     assert [view.on_stage(plan.artifact).shift for view in views[3:]] == [(2, 0), (1, 0), (0, 0)]
     assert [view.cell_m for view in views[:3]] == [-0.001, 0, 0.001]
+    assert plan.views[1].cell_m == 0  # the axis of the microscope stands at the centre
     assert [view.angular for view in views[:3]] == [False, True, False]
     assert with_sub_views(views) == views
     alone = plan_from_dict(IMAGE | {"image": {"nx": 1, "ny": 1}}, "p")

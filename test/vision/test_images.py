@@ -65,6 +65,13 @@ def test_impossible_images_are_refused(wrong, problem):
         picture_of(message(GREY, **({"encoding": "mono8"} | wrong)))
 
 
+def test_a_grey_value_of_16_bits_needs_two_bytes():
+    whole = message(GREY.astype("<u2"), "mono16")
+    whole.data = whole.data[:-1]
+    with pytest.raises(InputError, match="23 bytes in rows of 8 are not 4 x 3 pixels of mono16"):
+        picture_of(whole)
+
+
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(50)])
 def test_what_cannot_be_decoded_is_refused(data):
     with pytest.raises(InputError, match=r"^f\.png: not an image, or damaged; give PNG"):

@@ -72,6 +72,11 @@ def test_deficient_plans_are_refused_by_name(names, needs, lines):
     assert seen.unknowns - seen.rank == seen.deficiency
 
 
+def test_a_half_turn_spares_neither_the_quarter_turn_nor_the_shift():
+    assert plan_observability(plan_of("0,180", Artifact(5, 0.01))).advice == (
+        "add a view turned by 90 deg", "add a view shifted by one pitch along X")
+
+
 def test_angular_views_without_a_line_turn_are_refused():
     artifact = Artifact(5, 0.01, 24)
     plan = plan_of("0,90,tx", artifact)
