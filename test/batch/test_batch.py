@@ -26,6 +26,7 @@ from selfcal_ros.batch.table import (
     series_of,
     summary_lines,
 )
+from selfcal_ros.cli.batch import exit_code
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
@@ -242,6 +243,12 @@ def test_bags_are_found_below_1500_folders_and_links_to_themselves_are_passed(
     assert {record["exit_code"] for record in content(out)["records"]} == {0, 2}
     assert "n\\udcff.mcap" in (out / "table.csv").read_text()
     assert "udcff.mcap" in (out / "index.html").read_text()
+
+
+@pytest.mark.parametrize(("codes", "code"), [
+    ((), 0), ((0, 0), 0), ((0, 5), 5), ((5, 0, 4), 4), ((4, 3, 5), 3), ((5, 2, 3), 2), ((2, 1), 1)])
+def test_the_worst_bag_gives_the_exit_code(codes, code):
+    assert exit_code([{"exit_code": one} for one in codes]) == code
 
 
 def _empty(folder: Path) -> Path:

@@ -124,6 +124,7 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
 @pytest.mark.parametrize(("deg", "shift", "text"), [
     (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37° {ids}; turn it counter-"),
     (127, (0.013, -0.007), "the plate lies turned by 127°, not by 37° {ids}; turn it as planned "),
+    (307.6, (0.013, -0.007), "the plate lies turned by 307°, not by 37° {ids}; turn it as "),
     (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37° {ids}; turn it as planned "),
     (37, (0.0, 0.0), "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches "
      "{ids}; "),

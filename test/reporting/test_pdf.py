@@ -41,6 +41,16 @@ def test_residuals_take_pages_of_their_own(small, monkeypatch):
     assert pages_of(data) >= max(4, pages_of(small) + 1)
 
 
+def test_figures_stand_side_by_side_on_the_page(monkeypatch):
+    boxes = []
+    monkeypatch.setattr(pdf, "put", lambda drawing, axes, scale: boxes.append(axes.get_position()))
+    report_pdf(SMALL, chapters_of(SMALL), heading(SMALL, {}))
+    assert len(boxes) > 2
+    assert all(0 < box.x0 < box.x1 < 1 and 0 < box.y0 < box.y1 < 1 for box in boxes)
+    assert boxes[0].x1 < boxes[1].x0
+    assert boxes[0].y1 == pytest.approx(boxes[1].y1)
+
+
 def test_no_line_is_wider_than_the_page_and_no_cell_is_lost():
     words = [f"word{i}" for i in range(200)]
     rows = tuple(tuple(words[40 * j + 4 * i] * 4 for i in range(9)) for j in range(3))

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import null_space
+from scipy.stats import chi2, f
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
@@ -15,7 +16,8 @@ from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.planned import predict_recheck
-from selfcal_ros.estimation.recheck.solve import recheck
+from selfcal_ros.estimation.recheck.solve import _misfit, recheck
+from selfcal_ros.estimation.recheck.views import Gain, Seen
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset
@@ -35,6 +37,17 @@ from test.support.two_sessions import MICROSCOPE, TwoSessions
 PITCH = 0.01
 QUIET = {"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "stop_sigma_m": 20e-6}
 MODELS = {"none": "", "microscope": "microscope:0.01:0.01:0.002"}
+
+
+@pytest.mark.parametrize(("dof_noise", "p"), [(1e9, chi2.sf(100, 1)), (9, f.sf(100, 1, 9))])
+def test_one_degree_of_freedom_can_contradict_the_plate(dof_noise, p):
+    nothing = np.zeros((1, 1))
+    seen = Seen(nothing > 0, nothing, np.zeros(3), Gain(nothing, 4 * np.eye(2)),
+                np.array([12.0, 16.0]), 1)
+    (finding,) = _misfit(seen, dof_noise)
+    assert (finding.name, finding.size, finding.p) == ("plate_misfit", 10, pytest.approx(p))
+    assert _misfit(replace(seen, rest=np.array([3.0, 0.0])), dof_noise) == ()
+    assert _misfit(replace(seen, dof=0), dof_noise) == ()
 
 
 @pytest.fixture(autouse=True)
