@@ -47,7 +47,9 @@ def test_comments_cannot_break_out_of_their_line():
     ([], "it has no tables"),
     ([Table1D(0, 1.0, np.zeros(2))], "axis 0 is not in 1..32"),
     ([Table1D(1, 0.0, np.zeros(2))], "sample dist is zero"),
-    ([Table1D(1, 1.0, np.zeros(2))] * 9, "more than 8 tables correct axis 1")])
+    ([Table1D(1, 1.0, np.zeros(2))] * 9, "more than 8 tables correct axis 1"),
+    ([Table1D(1, 1.0, np.zeros(2)), Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2)))],
+     "a 2D table in a file of 1D tables")])
 def test_tables_that_break_a_rule_are_not_written(tables, what):
     with pytest.raises(InputError, match=what):
         cal_text(tables)

@@ -8,7 +8,7 @@ from selfcal_ros.papers import hu as module
 from selfcal_ros.papers.figures import hu_figures, qiao_figures
 from selfcal_ros.papers.hu import hu_text, reproduce_hu
 from selfcal_ros.papers.qiao import ROWS, SIZES, qiao_text, reproduce_qiao
-from selfcal_ros.reporting.figures.drawing import Path
+from selfcal_ros.reporting.figures.drawing import Discs, Path
 from test.support.drawings import cut_off, words_on_words
 
 
@@ -28,13 +28,18 @@ def test_figures_are_whole_and_their_keys_lie_beside_the_panels(hu, qiao):
         *(f"hu_figure_{number}" for number in range(4, 10)), "qiao_figure_3", "qiao_figure_4"]
     for figure in figures:
         assert cut_off(figure) == [] and words_on_words(figure) == [], figure.name
-    for figure in (figures[0], *figures[-2:]):
         paths = [item for item in figure.items if isinstance(item, Path)]
-        panels = [item.lines[0] for item in paths
+        assert all(item.fill or item.width > 0 for item in paths), figure.name
+        panels = [(item.lines[0][0], item.lines[0][2]) for item in paths
                   if item.stroke == "soft" and len(item.lines[0]) == 5]
+        draws = {round(float(x), 6) for item in figure.items if isinstance(item, Discs)
+                 for x, _ in item.centres}
+        ends = {round(float(x), 6) for item in paths if item.dash for x, _ in item.lines[0]}
+        assert ends <= draws, figure.name  # levels reach from the first draw to the last
         keys = [item.lines[0][0] for item in paths if item.width == 1.4]
-        assert keys and not any(low[0] < x < high[0] and low[1] < y < high[1]
-                                for x, y in keys for low, _, high, *_ in panels), figure.name
+        assert bool(keys) == (figure in (figures[0], *figures[-2:]))
+        assert not any(low[0] < x < high[0] and low[1] < y < high[1]
+                       for x, y in keys for low, high in panels), figure.name
 
 
 def test_hus_tables_lie_within_the_spread_of_draws(hu):
