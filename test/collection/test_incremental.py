@@ -267,6 +267,23 @@ def test_a_sample_that_comes_after_hours_finds_its_exposure():
     assert digest_of(collector) == digest([*cell.events, *hours])
 
 
+def test_a_late_sample_finds_its_exposure_beside_one_that_is_new():
+    cell = scene(count=0)
+    at_ns = cell.detections[12].stamp_ns
+    nearest = min(cell.samples, key=lambda s: abs(s.stamp_ns - at_ns))
+    others = [event for event in cell.events if event is not nearest]
+    x, y, theta = nearest.positions
+    late_one = replace(nearest, positions=(x + 1e-7, y, theta))
+    new = replace(cell.samples[-1], stamp_ns=cell.samples[-1].stamp_ns + 3_600_000_000_000)
+    collector = fresh()
+    for event in others:
+        add(collector, event)
+    collector.collect()
+    add(collector, new)
+    add(collector, late_one)
+    assert digest_of(collector) == digest([*others, late_one, new]) != digest([*others, new])
+
+
 def test_scores_that_are_reported_late_count_for_all():
     cell = scene(count=0)
     for index in range(25):

@@ -223,6 +223,17 @@ def test_two_named_marks_one_of_them_misread_tell_nothing():
     np.testing.assert_array_equal(found.index[:, good], marks[:, good])
 
 
+def test_a_plate_that_cannot_turn_is_not_turned():
+    p = np.array([[-0.02, 0.02, 0.0, 0.0], [0.0, 0.0, -0.02, 0.02]])
+    fit = fit_motion(p, Rigid(1e-3, 1e-6, 2e-6).at(p))
+    assert fit.rigid.phi_rad == pytest.approx(1e-3, rel=1e-5)
+    found = fit.known(0.01, 0.0)
+    assert (found.rigid.phi_rad, found.phi_error_rad) == (0.0, 0.0)
+    assert found.rigid.at(np.zeros(2)) == pytest.approx([1e-6, 2e-6], rel=1e-5)
+    single = fit_motion(p[:, :1], np.array([[1e-6], [2e-6]])).known(0.01, 0.035)
+    assert (single.rigid.phi_rad, single.phi_error_rad) == (0.0, 0.035)
+
+
 def test_a_rotation_is_told_to_the_lines_only_where_enough_marks_agree_on_it():
     p = np.array([[-0.01, 0.0, 0.01], [0.0, 0.0, 0.0]])
     assert fit_motion(p[:, :2], 0 * p[:, :2]).phi_error_rad == np.inf

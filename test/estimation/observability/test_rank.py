@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rank by components and misalignments is that of the full matrix."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability.rank import measured_observability, plan_observability
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
+from selfcal_ros.model.readings import subset
 from selfcal_ros.model.view import Plan, View
 from test.support.lattice_plans import plan_of
 from test.support.placed import SIX, plate
@@ -93,6 +98,21 @@ def test_too_many_missing_marks_are_refused():
     readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng, missing=0.7)
     with pytest.raises(NotIdentifiableError, match="read the missing marks: only"):
         calibrate(readings)
+
+
+def test_without_a_mark_the_rank_is_that_of_what_is_read():
+    """The full matrix of the readings, and seven degrees of freedom that the datum fixes."""
+    artifact = Artifact(5, 0.01)
+    plan = plan_of("0,90,tx", artifact)
+    rng = np.random.default_rng(0)
+    readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng)
+    readings = replace(readings, views=tuple(
+        subset(view, (view.m != 2) | (view.n != 2), np.ones(0, dtype=bool))
+        for view in readings.views))
+    system = prepare(readings, Options())[0].system
+    seen = measured_observability(system, artifact, plan.views)
+    assert seen.identifiable
+    assert seen.rank == seen.unknowns == np.linalg.matrix_rank(dense(system.grid), tol=1e-8) + 7
 
 
 @pytest.mark.parametrize(("lines", "more"), [

@@ -92,6 +92,21 @@ def test_a_search_needs_a_field_that_is_not_large_and_noise(
     assert searched == [False] * wanted
 
 
+def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(readings, monkeypatch):
+    searched = []
+    monkeypatch.setattr(search, "ALWAYS_SITES", 24)
+    monkeypatch.setattr(search, "_search", lambda *args, failed: searched.append(failed))
+    options = Options(terms=parse_terms(["plate_scale:1e-3"], ""))
+    solved = solve_joint(readings, options)
+    assert [test.name for test in solved.model.sizes if test.contradicted] == []
+    search_causes(solved, readings, options, failed=False)
+    assert searched == []
+    sizes = tuple(replace(test, p=0.0) for test in solved.model.sizes)
+    contradicted = replace(solved, model=replace(solved.model, sizes=sizes))
+    search_causes(contradicted, readings, options, failed=False)
+    assert searched == [True]
+
+
 def offsets_of(stop_sigma_m):
     """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
