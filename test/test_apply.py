@@ -138,6 +138,22 @@ def test_the_line_is_that_of_the_diagonals_if_x_and_y_err_alike(file, result, mo
     assert a == pytest.approx(2e-8 * result.noise.k_xy, rel=1e-6) and abs(b) < 1e-12
 
 
+def test_no_other_line_over_all_distances_is_lower_on_average(file, result, monkeypatch):
+    """With an error of the scale, U grows with the distance."""
+    monkeypatch.setattr(StageMap, "covariance", lambda self, x, y: 1e-16 * np.eye(
+        2 * len(x)) + 1e-12 * np.outer(np.append(x, y), np.append(x, y)))
+    stage, plate = load(file), result.artifact
+    i, j = np.triu_indices(25, 1)
+    x, y = plate.x_m.ravel(), plate.y_m.ravel()
+    length = np.hypot(x[j] - x[i], y[j] - y[i])
+    U = result.noise.k_xy * stage.length_error((x[i], y[i]), (x[j], y[j]))[1]
+    a, b = stage.length_uncertainty(anywhere=False)
+    assert b > 1e-7
+    for slope in np.linspace(0, 3 * b, 31):
+        above = (U - slope * length).max() + slope * length.mean()
+        assert above > (a + b * length.mean()) * (1 - 1e-6)
+
+
 def test_between_nodes_the_line_covers_the_interpolation_too(file, result):
     stage, plate, rng = load(file), result.artifact, np.random.default_rng(4)
     ends = rng.uniform(-2, 2, (4, 400)) * plate.grid_pitch_m

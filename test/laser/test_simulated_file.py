@@ -22,16 +22,18 @@ def test_every_example_is_read(path):
 
 def test_units_and_places_of_every_key():
     simulation = simulation_from_dict({
-        "machine": {"steps_mm": [10, 5], "ex_y": [0.1, 0.2], "ey_y": [0.3, 0.4], "stacked": True,
-                    "turns_urad": {"y": [[1, 2, 3], [4, 5, 6]]}},
+        "machine": {"steps_mm": [10, 5], "stacked": True,
+                    "ex_y": [0.1, 0.2, 0.7], "ey_y": [0.3, 0.4, 0.8],
+                    "turns_urad": {"y": [[1, 2, 3], [4, 5, 6], [7, 8, 9]]}},
         "setups": {"np": {"laser_mrad": [1], "mirror_mrad": [-2], "to_machine": False,
                           "abbe_mm": [1, 2, 3], "scale_ppm": 0.5}},
         "noise": {"distance_nm": 1, "reading_nm": 2, "linear_nm": 3, "repeats": 4}}, "s")
     machine, setup = simulation.machine, simulation.measurement.setups["np"]
     assert machine.steps_m == pytest.approx((0.01, 0.005)) and machine.stacked
-    np.testing.assert_allclose(machine.errors_m[1], [[1e-7, 3e-7], [2e-7, 4e-7]])
+    np.testing.assert_allclose(machine.errors_m[1], [[1e-7, 3e-7], [2e-7, 4e-7], [7e-7, 8e-7]])
     assert not machine.errors_m[0].any() and not machine.turns_rad[0].any()
-    np.testing.assert_allclose(machine.turns_rad[1], [[1e-6, 2e-6, 3e-6], [4e-6, 5e-6, 6e-6]])
+    assert machine.turns_rad.shape == (2, 3, 3)  # axes, blocks, components
+    np.testing.assert_allclose(machine.turns_rad[1], 1e-6 * np.arange(1, 10).reshape(3, 3))
     assert setup.laser_rad == pytest.approx((1e-3,)) and setup.mirror_rad == pytest.approx((-2e-3,))
     assert not setup.to_machine and setup.scale == pytest.approx(5e-7)
     assert setup.abbe_m == pytest.approx((1e-3, 2e-3, 3e-3))
