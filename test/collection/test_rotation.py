@@ -223,6 +223,13 @@ def test_two_named_marks_one_of_them_misread_tell_nothing():
     np.testing.assert_array_equal(found.index[:, good], marks[:, good])
 
 
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_fit_never_turns_further_than_the_largest_turn(sense):
+    p = np.array([[-0.02, 0.02, 0.0, 0.0], [0.0, 0.0, -0.02, 0.02]])
+    found = fit_motion(p, Rigid(sense * 2 * LARGEST_TURN_RAD).at(p)).rigid
+    assert found.phi_rad == pytest.approx(sense * LARGEST_TURN_RAD)
+
+
 def test_a_plate_that_cannot_turn_is_not_turned():
     p = np.array([[-0.02, 0.02, 0.0, 0.0], [0.0, 0.0, -0.02, 0.02]])
     fit = fit_motion(p, Rigid(1e-3, 1e-6, 2e-6).at(p))

@@ -54,6 +54,19 @@ def test_a_bicubic_map_of_a_smooth_stage_is_worth_more_between_the_nodes():
     assert (Compensator(emap, fitted="bicubic").halfway == linear).all()
 
 
+@pytest.mark.parametrize("method", ["bilinear", "bicubic"])
+def test_a_map_with_x_and_y_exchanged_has_its_errors_between_nodes_exchanged(method):
+    rng, artifact, other = np.random.default_rng(5), Artifact(9, PITCH_M, 0, 7), Artifact(
+        7, PITCH_M, 0, 9)
+    g = rng.normal(0, 1e-7, (2, *artifact.shape))
+    u = 1e-8 * rng.uniform(1, 9, (2, *artifact.shape))
+    one = ErrorMap(artifact, *g, *u, np.zeros(0), np.zeros(0))
+    exchanged = ErrorMap(other, g[1].T, g[0].T, u[1].T, u[0].T, np.zeros(0), np.zeros(0))
+    found = Compensator(one, method=method).halfway
+    assert found.any()
+    assert Compensator(exchanged, method=method).halfway == pytest.approx(found[::-1, ::-1])
+
+
 def test_a_parabola_and_a_fourth_power_have_the_error_of_their_formula():
     """c s^2: c / 4 halfway. s^4 through four nodes: 9 over two pitches, 9/16 over one."""
     s = np.linspace(-4, 4, 9)

@@ -58,3 +58,9 @@ def test_a_size_of_0_says_that_there_is_no_such_term():
     assert [term.name for term in Options(terms=terms).model_terms(visits=False)] == [
         "drift", "line_eccentricity", "rotation", "yaw"]
     assert Options(terms=terms, assumed=()).model_terms(visits=True) == terms[:1]
+
+
+@pytest.mark.parametrize(("size", "up"), [
+    (2.31e-7, 2.4e-7), (9.91e-7, 1.0e-6), (1.01e-3, 1.1e-3), (4.5, 4.5), (12.3, 13.0)])
+def test_a_size_is_rounded_up_to_two_figures(size, up):
+    assert ModelTerm("drift", size).rounded_up == ModelTerm("drift", up)
