@@ -36,7 +36,7 @@ def test_figures_are_whole_and_their_keys_lie_beside_the_panels(hu, qiao):
                  for x, _ in item.centres}
         ends = {round(float(x), 6) for item in paths if item.dash for x, _ in item.lines[0]}
         assert ends <= draws, figure.name  # levels reach from the first draw to the last
-        keys = [item.lines[0][0] for item in paths if item.width == 1.4]
+        keys = [item.lines[0][1] for item in paths if item.width == 1.4]
         assert bool(keys) == (figure in (figures[0], *figures[-2:]))
         assert not any(low[0] < x < high[0] and low[1] < y < high[1]
                        for x, y in keys for low, high in panels), figure.name
