@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
+from selfcal_ros.estimation.datum.covariance import MapsCovariance as Covariance
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -17,7 +17,7 @@ class MapCovariance:
     """Covariance of the XY map of one calibration; `field` is for a noise of 1."""
 
     artifact: Artifact
-    field: FieldCovariance
+    field: Covariance
     sigma_m: float
     sense: Sense
 
@@ -41,8 +41,6 @@ def map_covariance(measurements: Measurements, options: Options) -> MapCovarianc
     """Return the covariance of the map that `calibrate` gives for the same arguments."""
     model = fit_joint(measurements, replace(options, uncertainty=True))
     problem, found = model.problem, model.found
-    scale = (scale_datum(problem.system, options.reference, problem.half_width_m)
-             if options.reference else None)
-    field = FieldCovariance(problem.system, found.inverse, scale, found.xy.sigma,
-                            model.spread(options.reference))
+    field = Covariance(problem.system, found.inverse, options.reference, terms=model.spread,
+                       half_width_m=problem.half_width_m, sigma_m=found.xy.sigma)
     return MapCovariance(measurements.artifact, field, found.xy.sigma, measurements.sense)

@@ -11,14 +11,9 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
-from selfcal_ros.estimation.datum.covariance import FieldCovariance, scale_datum
-from selfcal_ros.estimation.datum.plate import BothCovariance
-from selfcal_ros.estimation.joint.images import (
-    ImageNoise,
-    images_behind,
-    kept_rotations,
-    share_of,
-)
+from selfcal_ros.estimation.datum.angular import conditions_for, lines_alone
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
+from selfcal_ros.estimation.joint.images import images_behind, kept_rotations, share_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
@@ -27,8 +22,8 @@ from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Marks, system_of
-from selfcal_ros.estimation.observability.prediction import theta_matrix
 from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import COMBINED, PRIOR, CalibrationResult
 from selfcal_ros.model.view import View
@@ -62,10 +57,10 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     rows = unit_rows(known)
     if is_flipped(result):
         rows = rows[:, ::-1, ::-1]
-    cover = _exact_field(result, system).of(rows)
+    maps = maps_behind(result, system)
+    cover = maps.of(rows)
     if (images := images_behind(result, system)) is not None:
-        nowhere = np.zeros((len(rows), *system.grid.views.plate_shape))
-        cover = cover + of_images(result, images, both_behind(result, system), (rows, nowhere))
+        cover = cover + share_of(result) * images.added_covariance(maps.sensitivities(rows))
     factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
     return _sized(cover + factors.T @ factors, u), True
 
@@ -97,8 +92,10 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
     system = system_behind(result)
     if system is None or not system.angular.n_views:
         return u**2, False
-    cover = theta_matrix(system, result.artifact, result.error_map.datum_theta,
-                         sense=Sense(result.sense))
+    conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
+                                Sense(result.sense), half_width_m(result))
+    to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
+    cover = lines_alone(system).of(to_datum.T, np.zeros(to_datum.shape))
     if is_flipped(result):
         back = -np.arange(len(known)) % len(known)
         cover = cover[np.ix_(back, back)]
@@ -149,13 +146,13 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     system = system_behind(result)
     if system is None or _lacks_terms(result):
         return float("nan"), float("nan")
-    length = result.plate.grid_pitch_m * max(result.plate.reach)
-    variance = np.diag(_exact_field(result, system).of(system.gauge.shear))
+    variance = np.diag(maps_behind(result, system).of(system.gauge.shear))
     shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
     moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
         "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
     variance = variance + _added(result)
-    u = np.sqrt((variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2) / length
+    u = np.sqrt((variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2)
+    u = u / half_width_m(result)
     return float(u[0]), float(u[1])
 
 
@@ -172,36 +169,19 @@ def is_flipped(result: CalibrationResult) -> bool:
     return result.sense == Sense.PLATE_MOVES
 
 
-def _exact_field(result: CalibrationResult, system: NormalEquations) -> FieldCovariance:
-    """Return the covariance of the map for unit noise, without terms of the model."""
-    length, scale = result.plate.grid_pitch_m * max(result.plate.reach), None
-    if result.reference is not None:
-        scale = scale_datum(system, ReferenceLength(**result.reference), length)
-    return FieldCovariance(system, bounded_inverse(result, system), scale, result.noise.sigma_xy)
+def half_width_m(result: CalibrationResult) -> float:
+    """Return the longer half width of the plate of a result, m."""
+    return result.plate.grid_pitch_m * max(result.plate.reach)
 
 
-def both_behind(result: CalibrationResult, system: NormalEquations) -> BothCovariance:
+def maps_behind(result: CalibrationResult, system: NormalEquations) -> MapsCovariance:
     """Return the covariance of both maps for unit noise, without terms of the model."""
     reference = None if result.reference is None else ReferenceLength(**result.reference)
-    return BothCovariance(system, bounded_inverse(result, system), reference,
-                          half_width_m=result.plate.grid_pitch_m * max(result.plate.reach),
-                          sigma_m=result.noise.sigma_xy)
-
-
-def of_images(result: CalibrationResult, images: ImageNoise, both: BothCovariance,
-              rows: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return what the noise of images adds to the covariance of functionals of both maps.
-
-    For unit noise; `rows` are the factors of the stage's map and those of the plate's.
-    """
-    return share_of(result) * images.added_covariance(both.sensitivities(*rows))
-
-
-def bounded_inverse(result: CalibrationResult, system: NormalEquations) -> np.ndarray:
-    """Return the covariance of the misalignments of a result for unit noise of a grid reading."""
-    length = result.plate.grid_pitch_m * max(result.plate.reach)
-    return system.inverse(bounded_ratio(system, result.noise.sigma_xy, result.noise.sigma_theta,
-                                        length) if system.angular.n_views else 1.0)
+    noise, length = result.noise, half_width_m(result)
+    ratio = bounded_ratio(system, noise.sigma_xy, noise.sigma_theta,
+                          length) if system.angular.n_views else 1.0
+    return MapsCovariance(system, system.inverse(ratio), reference, half_width_m=length,
+                          sigma_m=noise.sigma_xy)
 
 
 def system_behind(result: CalibrationResult) -> NormalEquations | None:

@@ -14,15 +14,16 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import (
     MAX_LINES,
-    both_behind,
+    half_width_m,
     is_flipped,
-    of_images,
+    maps_behind,
     system_behind,
     unit_rows,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
-from selfcal_ros.estimation.datum.plate import BothCovariance
-from selfcal_ros.estimation.joint.images import ImageNoise, images_behind
+from selfcal_ros.estimation.datum.angular import LinesCovariance
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
+from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -57,14 +58,9 @@ class Together:
         plate = self.result.artifact_map
         return np.isfinite(plate.ax + plate.ay + plate.u_ax + plate.u_ay)
 
-    @property
-    def length_m(self) -> float:
-        """Longer half width of the plate."""
-        return self.result.plate.grid_pitch_m * max(self.result.plate.reach)
-
     @cached_property
-    def _both(self) -> BothCovariance:
-        return both_behind(self.result, self.system)
+    def _maps(self) -> MapsCovariance:
+        return maps_behind(self.result, self.system)
 
     @cached_property
     def _images(self) -> ImageNoise | None:
@@ -72,10 +68,11 @@ class Together:
 
     def _of_noise(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the covariance of functionals of both maps for noise of marks and images."""
-        cover = self._both.of(sites, marks)
+        cover = self._maps.of(sites, marks)
         if self._images is None:
             return cover
-        return cover + of_images(self.result, self._images, self._both, (sites, marks))
+        return cover + share_of(self.result) * self._images.added_covariance(
+            self._maps.sensitivities(sites, marks))
 
     @cached_property
     def _effects(self) -> np.ndarray:
@@ -92,7 +89,7 @@ class Together:
         of_stage = stage[:, :, sites].reshape(len(stage), here)
         maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
         maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
-        maps[:r, -4:] = self._kept("microscope", (4,)) / self.length_m
+        maps[:r, -4:] = self._kept("microscope", (4,)) / half_width_m(self.result)
         return maps
 
     def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -183,8 +180,10 @@ class Together:
         if is_flipped(result):
             stage = -stage[:, -np.arange(count) % count]
         noise = result.noise
-        cover = self._both.of_lines(stage, centre[:, count:], (noise.sigma_xy, noise.sigma_theta))
-        terms = self._kept("lines", (2 * count,)) @ centre.T * noise.sigma_xy / self.length_m
+        cover = LinesCovariance(self._maps, (noise.sigma_xy, noise.sigma_theta)).of(
+            stage.T, centre[:, count:].T)
+        terms = self._kept("lines", (2 * count,)) @ centre.T * (
+            noise.sigma_xy / half_width_m(result))
         cover = cover + terms.T @ terms
         white = np.diag(cover)[:count][known[0]].sum()
         found = (emap.u_g_theta[known[0]] ** 2).sum()

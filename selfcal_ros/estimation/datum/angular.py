@@ -7,16 +7,13 @@ with slopes and rotations from the readings.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.covariance import (
-    FieldCovariance,
-    plates_of_terms,
-    scale_by_plate,
-)
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
@@ -169,116 +166,151 @@ def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[flo
     return float(chdtrc(n - 1, value)), float(np.abs(contrast).max())
 
 
-def angular_variance(field: FieldCovariance, conditions: Conditions, *,
-                     sigma: tuple[float, float], half_width_m: float
-                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure.
+class LinesCovariance:
+    """Covariance of both angular maps, rad^2 (method eq. 4.9).
+
+    As of the XY maps: a map in its datum is the free one and a few fields times functionals.
 
     Parameters
     ----------
-    field : FieldCovariance
-        Covariance of the XY map.
-    conditions : Conditions
-        The angular datum.
+    cover : MapsCovariance
+        That of the XY maps.
     sigma : tuple of float
         Noise of one grid reading, m, and of one angular reading, rad.
-    half_width_m : float
-        Length of the unit of the system's positions, m.
     """
-    system, (sigma_xy, sigma_theta) = field.system, sigma
-    angular, rows, gain = system.angular, conditions.rows, conditions.gain
-    per_phi = sigma_xy**2 / half_width_m**2
-    p_phi = field.inverse[np.ix_(system.phi_at, system.phi_at)] * per_phi
-    y = angular.response
 
-    columns = angular.solve(np.ascontiguousarray(rows.T)) * sigma_theta**2
-    columns = columns + y @ (p_phi @ (y.T @ rows.T))
-    variance = sigma_theta**2 * _inverse_diagonal(system) + np.einsum("ka,ab,kb->k", y, p_phi, y)
+    def __init__(self, cover: MapsCovariance, sigma: tuple[float, float]) -> None:
+        self.cover, self.system, self.angular = cover, cover.system, cover.system.angular
+        self._xy2, self._theta2 = sigma[0] ** 2, sigma[1] ** 2
+        total = self.angular.weight.sum(axis=0)
+        self._of_means = np.where(total > 0, self._theta2 / np.where(total > 0, total, 1.0), 0.0)
 
-    flat = field.project(conditions.slopes.reshape(len(rows), -1).T)
-    n = 3 * system.grid.n_views
-    answer = np.real(system.grid.response.conj().T @ flat) * sigma_xy**2 / half_width_m
-    with_slopes = y @ (field.inverse[np.ix_(system.phi_at, np.arange(n))] @ answer)
-    of_slopes = field.of(conditions.slopes) * sigma_xy**2
+    @cached_property
+    def terms(self) -> tuple[np.ndarray, np.ndarray]:
+        """Free angular maps of stage and plate for a unit of each coefficient, (K, p)."""
+        terms, field = self.cover.terms, -self.cover.terms.turned
+        phi = terms.parameters[self.system.phi_at] / self.cover.length
+        return field, self._plate(np.moveaxis(terms.lines, 0, -1), field, phi)
 
-    turned = field.terms.turned
-    cover = field.terms.covariance * sigma_xy**2
-    sloped = np.real(flat.conj().T @ field.terms.fields)
-    columns = columns + turned @ (cover @ (rows @ turned).T)
-    variance += np.einsum("kp,kp->k", turned @ cover, turned)
-    with_slopes = with_slopes - turned @ (cover @ sloped.T)
-    cross = rows @ with_slopes
-    closure = of_slopes + rows @ columns - cross - cross.T
-    both = with_slopes - columns
-    variance = variance + np.einsum("kc,cd,kd->k", gain, closure, gain)
-    variance = variance + 2 * np.einsum("kc,kc->k", gain, both)
-    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan), closure
+    def of_stage(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
+        rows = conditions.rows.T
+        misclosure = -rows, np.zeros(rows.shape), self.cover.functionals(conditions.slopes)
+        closure, y = self.of(*misclosure), self.angular.response
+        own = self._theta2 * self._inverse_diagonal() + np.einsum("ka,ab,kb->k", y, self._phi, y)
+        own += np.einsum("kp,pq,kq->k", self.terms[0], self._of_terms, self.terms[0])
+        spread = self._spread(*misclosure)[0]
+        variance = own + _by(conditions.gain, closure, spread)
+        return np.where(self.system.known_lines, np.maximum(variance, 0.0), np.nan), closure
 
+    def of_plate(self) -> np.ndarray:
+        """Return the variance of the plate's angular map, (K,), in the datum `zero_mean`.
 
-def _inverse_diagonal(system: NormalEquations) -> np.ndarray:
-    n = system.angular.n_lines
-    units = (np.eye(n, min(BLOCK, n - start), -start) for start in range(0, n, BLOCK))
-    return np.concatenate([(unit * system.angular.solve(unit)).sum(axis=0) for unit in units])
+        The rotations of the views are those for which neither stage nor plate is turned.
+        """
+        system, angular, count = self.system, self.angular, self.angular.n_lines
+        of_sites, of_marks = (-gauge.dual(2).reshape(-1, 1) / self.cover.length
+                              for gauge in (system.gauge, system.plate_gauge))
+        datum = ((system.known_lines / system.known_lines.sum())[:, None], np.zeros((count, 1)),
+                 (of_sites, of_marks))
+        own = np.zeros(count)
+        for here in self._blocks():
+            one = np.eye(count, len(here), -here[0])
+            rows, factors, of_terms, _ = self._free(0 * one, one)
+            own[here] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
+            own[here] += self._xy2 * np.einsum("vl,vw,wl->l", factors, self.cover.inverse, factors)
+            own[here] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
+        variance = own + self._of_means + _by(np.ones((count, 1)), self.of(*datum),
+                                              self._spread(*datum)[1])
+        return np.where(system.known_plate_lines, variance, np.nan)
 
+    def of(self, stage: np.ndarray, plate: np.ndarray,
+           maps: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
+        """Return the covariance of functionals of the free maps, (k, k).
 
-def angular_plate_variance(cover: FieldCovariance, *, columns: np.ndarray,
-                           lines: tuple[np.ndarray, np.ndarray], sigma: tuple[float, float],
-                           half_width_m: float) -> np.ndarray:
-    """Return the variance of the plate's angular map, (K,), rad^2, in the datum `zero_mean`.
+        Parameters
+        ----------
+        stage, plate : float array (K, k)
+            Factors of both angular maps.
+        maps : tuple of complex array (sites, k) and (marks, k), optional
+            Factors of both XY maps in addition, 1/m.
+        """
+        rows, factors, of_terms, cov = self._free(stage, plate, maps)
+        cov = cov + self._theta2 * (rows.T @ self.angular.solve(np.ascontiguousarray(rows)))
+        cov += (plate.T * self._of_means) @ plate
+        cov += self._xy2 * (factors.T @ self.cover.inverse @ factors)
+        cov += of_terms.T @ self._of_terms @ of_terms
+        return (cov + cov.T) / 2
 
-    The rotations of the views are those for which neither stage nor plate is turned.
+    def _free(self, stage: np.ndarray, plate: np.ndarray,
+              maps: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, ...]:
+        """Return functionals as those of stage lines, misalignments, 1/m, and terms.
 
-    Parameters
-    ----------
-    cover : FieldCovariance
-        Covariance of the stage's map.
-    columns : complex array (p, views, nx, ny)
-        Columns of the terms of `cover` at the marks, plate frame.
-    lines : tuple of array
-        Indices of the terms that act on lines, (q,), and their columns (q, views, K), rad.
-    sigma : tuple of float
-        Noise of one grid reading, m, and of one angular reading, rad.
-    half_width_m : float
-        Unit of the positions, m.
-    """
-    system, (sigma_xy, sigma_theta) = cover.system, sigma
-    angular, share = system.angular, system.angular.relative_weight
-    known, count = system.known_lines, system.angular.n_lines
-    noise = (sigma_xy / half_width_m) ** 2
-    dual = system.plate_gauge.dual(2)
-    turn, n = scale_by_plate(system, dual, mode=2), 3 * system.grid.n_views
-    turned = np.zeros(system.size)
-    turned[:n] = np.real(system.grid.response.conj().T @ turn.rows) - turn.parameters
-    total = noise * (turn.variance + float(np.real(
-        np.vdot(turn.rows, system.grid.factor.solve(turn.rows)))))
-    moved = lines_of_terms(cover, lines, half_width_m)
-    if len(columns):
-        plates = plates_of_terms(cover, columns).reshape(len(columns), -1)
-        moved = moved - (np.real(system.gauge.dual(2).reshape(-1).conj() @ cover.terms.fields)
-                         + np.real(plates @ dual.reshape(-1).conj())) / half_width_m
-    weight = angular.weight.sum(axis=0)
-    out = total + sigma_theta**2 / np.where(weight > 0, weight, 1)
-    out = out + np.einsum("kp,pq,kq->k", moved, cover.terms.covariance * sigma_xy**2, moved)
-    for start in range(0, count, BLOCK):
-        here = np.arange(start, min(start + BLOCK, count))
-        rows = np.tile((known / known.sum())[:, None], len(here))
+        And the covariance of the part that is of sites and marks alone, (k, k), rad^2.
+        """
+        angular, share = self.angular, self.angular.relative_weight
+        rows, read = stage.copy(), np.flatnonzero(plate.any(axis=1))
         for view in range(angular.n_views):
-            rows -= angular.rows(view, here).T * share[view, here]
-        answer = np.tile(turned[:, None], len(here))
-        answer[system.phi_at] -= angular.response.T @ rows + share[:, here]
-        out[here] += sigma_theta**2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
-        out[here] += noise * np.einsum("vl,vw,wl->l", answer, cover.inverse, answer)
-    return np.where(system.known_plate_lines, out, np.nan)
+            rows -= angular.rows(view, read).T @ (share[view, read, None] * plate[read])
+        factors = np.zeros((self.system.size, rows.shape[1]))
+        factors[self.system.phi_at] = -(angular.response.T @ rows + share @ plate)
+        factors /= self.cover.length
+        of_terms = self.terms[0].T @ stage + self.terms[1].T @ plate
+        if maps is None:
+            return rows, factors, of_terms, np.zeros((rows.shape[1],) * 2)
+        noise, of_maps, terms_of_maps = self.cover.independent(*maps)
+        factors[:len(of_maps)] += of_maps
+        return rows, factors, of_terms + terms_of_maps, self._xy2 * noise
+
+    def _spread(self, stage: np.ndarray, plate: np.ndarray,
+                maps: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the covariance of functionals with both free maps, (K, k) each."""
+        rows, factors, of_terms, _ = self._free(stage, plate, maps)
+        moved = self._of_terms @ of_terms
+        phi = self._xy2 / self.cover.length * (self.cover.inverse @ factors)[self.system.phi_at]
+        field = self._theta2 * self.angular.solve(np.ascontiguousarray(rows))
+        field -= self.angular.response @ phi
+        of_plate = self._plate(np.zeros(1), field, phi) + self._of_means[:, None] * plate
+        return field + self.terms[0] @ moved, of_plate + self.terms[1] @ moved
+
+    def _plate(self, y: np.ndarray, field: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """Return what readings, maps (K, k) and rotations (views, k) make of the plate."""
+        left = y - self.angular.gather(field) - phi[:, None]
+        return np.einsum("vk,vkp->kp", self.angular.relative_weight, left)
+
+    @property
+    def _of_terms(self) -> np.ndarray:
+        """Covariance of the coefficients of the terms, (p, p)."""
+        return self.cover.terms.covariance * self._xy2
+
+    @property
+    def _phi(self) -> np.ndarray:
+        """Covariance of the rotations of the angular views, rad^2."""
+        at = np.ix_(self.system.phi_at, self.system.phi_at)
+        return self.cover.inverse[at] * (self._xy2 / self.cover.length**2)
+
+    def _blocks(self) -> list[np.ndarray]:
+        n = self.angular.n_lines
+        return [np.arange(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
+
+    def _inverse_diagonal(self) -> np.ndarray:
+        n = self.angular.n_lines
+        return np.concatenate([self.angular.solve(np.eye(n, len(here), -here[0]))[
+            here, here - here[0]] for here in self._blocks()])
 
 
-def lines_of_terms(cover: FieldCovariance, lines: tuple[np.ndarray, np.ndarray],
-                    half_width_m: float) -> np.ndarray:
-    """Return the plate's angular map for a unit of each coefficient, (K, p), no rotation taken."""
-    system, field = cover.system, -cover.terms.turned
-    share = system.angular.relative_weight
-    own: np.ndarray = np.zeros((*share.shape, field.shape[1]))
-    for at, values in zip(*lines, strict=True):
-        own[..., at] = values
-    phi = cover.terms.parameters[system.phi_at] / half_width_m
-    found = np.einsum("vk,vkp->kp", share, own - system.angular.gather(field) - phi[:, None])
-    return found + field[system.known_lines].mean(axis=0)
+def _by(fields: np.ndarray, inner: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return what fields (K, k) times functionals add to the variances of a free map, (K,)."""
+    return np.einsum("kc,kc->k", fields @ inner + 2 * spread, fields)
+
+
+def lines_alone(system: NormalEquations) -> LinesCovariance:
+    """Return the covariance for unit noise of the lines, rotations of grid views taken as known.
+
+    The grid determines them thousands of times better than the lines.
+    """
+    angular, inverse = system.angular, np.zeros((system.size, system.size))
+    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
+    at = system.phi_at[free]
+    inverse[np.ix_(at, at)] = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
+    return LinesCovariance(MapsCovariance(system, inverse), (1.0, 1.0))

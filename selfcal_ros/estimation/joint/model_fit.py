@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.errors import NotSettledError
-from selfcal_ros.estimation.datum.covariance import TermSpread, scale_of_plate
+from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     Sums,
@@ -112,16 +111,22 @@ class ModelFit:
             return np.zeros((0, 0))
         return self.equations.inverse(self.found.xy.sigma)
 
-    def spread(self, reference: ReferenceLength | None) -> TermSpread | None:
-        """Return how the terms' uncertainty reaches a map in the scale of `reference`, or None."""
+    @property
+    def spread(self) -> TermSpread | None:
+        """What the terms' uncertainty does to the maps; None without terms."""
         if self.equations is None:
             return None
         now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
-        system, shapes = self.problem.system, now.columns.shapes
-        dual = scale_of_plate(system, reference)
-        of_marks = shapes.against(shapes.sums(system.grid.relative_weight * dual))
-        return TermSpread(now.projected.fields, now.projected.parameters,
-                          now.inverse(self.found.xy.sigma), of_marks, now.projected.turned)
+        grid, fit, columns, lines = (self.problem.system.grid, now.projected, now.columns.grid,
+                                     now.columns.lines)
+        on_lines = np.zeros((now.n, *self.problem.system.angular.weight.shape))
+        if len(lines.at):
+            on_lines[lines.at] = lines.values
+        plates = [grid.plate(*one)[0].ravel() for one in zip(
+            columns, fit.fields.T.reshape(-1, *grid.views.shape),
+            fit.parameters[:3 * grid.n_views].T, strict=True)]
+        return TermSpread(columns, on_lines, fit.fields, np.array(plates).T, fit.parameters,
+                          fit.turned, now.inverse(self.found.xy.sigma))
 
 
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:

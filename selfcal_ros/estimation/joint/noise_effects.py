@@ -9,12 +9,11 @@ line or a pass, which repeats taken in quick succession do not show (method eq. 
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from selfcal_ros.estimation.datum.covariance import FieldCovariance
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
 from selfcal_ros.estimation.terms.equations import TermEquations
@@ -58,7 +57,7 @@ def axis_contrast(model: ModelFit) -> float:
     return float((squares[0] - squares[1]) / squares.sum())
 
 
-def structured(model: ModelFit, cover: FieldCovariance,
+def structured(model: ModelFit, cover: MapsCovariance,
                rows: np.ndarray | None = None) -> np.ndarray | float:
     """Return what noise that is neither equal along x and y nor white adds to the variances.
 
@@ -72,7 +71,7 @@ def structured(model: ModelFit, cover: FieldCovariance,
     return added + image_variances(model, cover, rows)
 
 
-def image_variances(model: ModelFit, cover: FieldCovariance, rows: np.ndarray | None = None, *,
+def image_variances(model: ModelFit, cover: MapsCovariance, rows: np.ndarray | None = None, *,
                     plate: bool = False) -> np.ndarray | float:
     """Return what the noise that marks of an image share adds to the variances for unit noise.
 
@@ -84,16 +83,16 @@ def image_variances(model: ModelFit, cover: FieldCovariance, rows: np.ndarray | 
     images = model.problem.images
     if images is None or not (share := images.noises(model.found.residuals).share):
         return 0.0
-    of = _plate_variances if plate else partial(added_variances, rows=rows)
-    added = of(model, cover, images.added)
-    whole = np.stack(cover.diagonal()) if rows is None else np.diag(cover.of(rows))
+    added = added_variances(cover, images.added, rows, plate=plate)
+    whole = (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(
+        cover.of(rows))
     if (added < -whole).any():
-        own = of(model, cover, images.own)
+        own = added_variances(cover, images.own, rows, plate=plate)
         added = added * np.minimum(1.0, whole / np.where(own > 0, own, 1.0))
     return share * added
 
 
-def axis_variances(model: ModelFit, cover: FieldCovariance,
+def axis_variances(model: ModelFit, cover: MapsCovariance,
                    rows: np.ndarray | None = None) -> np.ndarray:
     """Return what noise along x in place of y adds to the variances, for unit noise.
 
@@ -101,53 +100,37 @@ def axis_variances(model: ModelFit, cover: FieldCovariance,
     """
     turn = model.problem.to_stage[:, None, None] ** 2
     weight = model.problem.system.grid.weight
-    return added_variances(model, cover, lambda rest: np.einsum(
+    return added_variances(cover, lambda rest: np.einsum(
         "vij,kvij->k", weight, (turn * rest**2).real), rows)
 
 
-def added_variances(model: ModelFit, cover: FieldCovariance,
-                    of: Callable[[np.ndarray], np.ndarray],
-                    rows: np.ndarray | None = None, *,
-                    columns: np.ndarray | None = None) -> np.ndarray:
-    """Return `of` the sensitivities of each coordinate of the map, (2, nx, ny), or of functionals.
+def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray],
+                    rows: np.ndarray | None = None, *, plate: bool = False) -> np.ndarray:
+    """Return `of` the sensitivities of each coordinate of a map, (2, nx, ny), or of functionals.
 
     Parameters
     ----------
-    model, cover : ModelFit, FieldCovariance
-        The fit, and the covariance of its map.
+    cover : MapsCovariance
+        The covariance of the maps.
     of : callable
         Sensitivities of k coordinates to the readings, over their weights, plate frame, complex
         (k, views, nx, ny) -> k variances for unit noise.
     rows : complex array (k, nx, ny), optional
-        Functionals of the map, instead of its coordinates.
-    columns : complex array (p, views, nx, ny), optional
-        Columns of the terms in the equations of `cover`, where these are not those of the fit.
+        Functionals of the stage's map, in place of its coordinates.
+    plate : bool
+        Take the coordinates of the plate's map.
     """
-    grid = cover.system.grid
-    if columns is None and model.equations is not None:
-        columns = model.equations.columns.grid
-    alone = None
-    if cover.scale is not None and cover.scale.dual is not None:  # readings of marks in the scale
-        total = grid.weight.sum(axis=0)
-        alone = np.where(grid.read, cover.scale.dual / np.where(total > 0, total, 1), 0)
-
-    def sensitivities(rows: np.ndarray) -> np.ndarray:
-        field, parameters, terms = cover.solved(rows.T)
-        y = np.zeros(1) if columns is None else np.tensordot(terms.T, columns, axes=1)
-        rest = grid.plate(-y, field.T.reshape(-1, *grid.views.shape), parameters.T)[1]
-        if alone is not None:
-            grown = np.real(grid.views.z_sites.ravel().conj() @ rows.T)
-            rest = rest - grown[:, None, None, None] * alone
-        return rest
-
     if rows is not None:
-        return of(sensitivities(rows.reshape(len(rows), -1)))
-    out = np.zeros((2, grid.n_sites))
-    for values, unit in zip(out, (1, 1j), strict=True):
-        for start in range(0, grid.n_sites, CHUNK):
-            some = unit * np.eye(CHUNK, grid.n_sites, start)[:grid.n_sites - start]
-            values[start:start + CHUNK] = of(sensitivities(some))
-    return out.reshape(2, *grid.views.shape)
+        return of(cover.sensitivities(rows))
+    views = cover.system.grid.views
+    shape, other = (views.plate_shape, views.shape) if plate else (views.shape, views.plate_shape)
+    n, out = shape[0] * shape[1], []
+    for start in range(0, n, CHUNK):
+        unit = np.eye(min(CHUNK, n - start), n, start).reshape(-1, *shape)
+        nothing = np.zeros((len(unit), *other))
+        out.append([of(cover.sensitivities(*((nothing, unit * part) if plate else
+                                             (unit * part, nothing)))) for part in (1, 1j)])
+    return np.concatenate(out, axis=1).reshape(2, *shape)
 
 
 def sensitivities_of_terms(equations: TermEquations, to_terms: np.ndarray) -> np.ndarray:
@@ -165,34 +148,6 @@ def sensitivities_of_terms(equations: TermEquations, to_terms: np.ndarray) -> np
     fields = (to_terms @ fit.fields.T).reshape(-1, *grid.views.shape)
     return grid.plate(np.tensordot(to_terms, equations.columns.grid, axes=1), fields,
                       to_terms @ fit.parameters[:3 * grid.n_views].T)[1]
-
-
-def _plate_variances(model: ModelFit, cover: FieldCovariance,
-                     of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return `of` the sensitivities of each coordinate of the plate's map, (2, nx, ny).
-
-    Parameters
-    ----------
-    model, of
-        As in `added_variances`; sensitivities of one view are turned alike.
-    cover : FieldCovariance
-        Of the plate's map, in the exchanged equations (method eq. 4.13).
-    """
-    views = model.problem.system.grid.views
-    at = views.site_index.reshape(len(views.phases), -1)
-    here = at >= 0
-    place = np.where(here, at, 0)
-
-    def of_marks(rest: np.ndarray) -> np.ndarray:
-        moved = np.take_along_axis(rest.reshape(len(rest), *at.shape), place[None], axis=2)
-        return of(np.where(here, moved, 0).reshape(rest.shape))
-
-    if model.equations is None:
-        return added_variances(model, cover, of_marks)
-    marks, (view, mark) = model.equations.columns.grid, np.nonzero(here)
-    columns = np.zeros((len(marks), *at.shape), dtype=complex)
-    columns[:, view, at[here]] = (marks.reshape(columns.shape)[:, view, mark] * views.phases[view])
-    return added_variances(model, cover, of_marks, columns=columns.reshape(marks.shape))
 
 
 TESTED = 5
@@ -223,7 +178,7 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     return found if p < F_LEVEL and 1 + 2 * found.sum() > SAME**2 else np.zeros(0)
 
 
-def correlated_variances(model: ModelFit, cover: FieldCovariance, correlation: np.ndarray,
+def correlated_variances(model: ModelFit, cover: MapsCovariance, correlation: np.ndarray,
                          rows: np.ndarray | None = None) -> np.ndarray:
     """Return what correlated noise adds to the variances, as `added_variances`."""
     views = _by_time(model)
@@ -238,7 +193,7 @@ def correlated_variances(model: ModelFit, cover: FieldCovariance, correlation: n
             total += 2 * products @ correlation
         return total
 
-    return added_variances(model, cover, of, rows)
+    return added_variances(cover, of, rows)
 
 
 def _by_time(model: ModelFit) -> list[tuple[int, ViewVisits, np.ndarray, np.ndarray]]:

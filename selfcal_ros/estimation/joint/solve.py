@@ -16,19 +16,12 @@ from selfcal_ros.errors import (
     NotSettledError,
 )
 from selfcal_ros.estimation.datum.angular import (
-    angular_plate_variance,
-    angular_variance,
+    LinesCovariance,
     conditions_for,
-    lines_of_terms,
     misclosure_test,
 )
-from selfcal_ros.estimation.datum.covariance import (
-    FieldCovariance,
-    plates_of_terms,
-    scale_datum,
-    scale_of,
-)
-from selfcal_ros.estimation.datum.plate import BothCovariance, plate_covariance
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
+from selfcal_ros.estimation.datum.scale import scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
 from selfcal_ros.estimation.joint.images import image_noise, kept_images
@@ -49,6 +42,7 @@ from selfcal_ros.estimation.joint.solved import (
     noise_of,
     saved_terms,
 )
+from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
@@ -58,7 +52,6 @@ from selfcal_ros.estimation.observability.rank import identifies, measured_obser
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
 from selfcal_ros.estimation.terms.places import places_of
-from selfcal_ros.estimation.terms.shapes import NO_LINES
 from selfcal_ros.estimation.terms.sizes import require_terms_told
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
@@ -71,7 +64,7 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
-from selfcal_ros.model.view import LatticePose, Plan
+from selfcal_ros.model.view import Plan
 
 
 def solve_joint(measurements: Measurements, options: Options) -> Solved:
@@ -167,8 +160,14 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     sigma = np.full(problem.system.known_sites.shape, found.xy.sigma)
     if problem.direct and options.uncertainty is not False:
         sigma = sigma * noise_gain(problem, found)
-    error_map, closure, kept = _error_map(measurements, options, model=model, sigma=sigma)
-    artifact_map = _artifact_map(model, options, rms(sigma))
+    cover = None
+    wanted = options.uncertainty is not False
+    # the datum of the axes is tested in any case
+    if problem.direct and (wanted or problem.conditions.datum is ThetaDatum.XY_AXES):
+        cover = MapsCovariance(problem.system, found.inverse, options.reference, terms=model.spread,
+                               half_width_m=problem.half_width_m, sigma_m=found.xy.sigma)
+    error_map, closure, kept = _error_map(measurements, model, cover, sigma, wanted=wanted)
+    artifact_map = _artifact_map(model, cover if wanted else None, rms(sigma))
     findings = (*_unchecked(problem.system, measurements.sense),
                 *_magnification(artifact_map, options))
     if not problem.direct and options.uncertainty is None:
@@ -265,26 +264,23 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
     return tuple(out)
 
 
-def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
-               sigma: np.ndarray) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
+def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovariance | None,
+               sigma: np.ndarray, *, wanted: bool
+               ) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
     `sigma` is the noise of a reading as it counts at each site, m; the factors are those of
-    `selfcal_ros.estimation.joint.solved`.
+    `selfcal_ros.estimation.joint.solved`. The uncertainty is given if it is `wanted`.
     """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
     kept: dict[str, Any] = {}
-    wanted = options.uncertainty is not False
-    tested = problem.conditions.datum is ThetaDatum.XY_AXES  # that the stage keeps its axes
-    if problem.direct and (wanted or tested):
-        scale = (scale_datum(system, options.reference, length) if options.reference else None)
-        cover = FieldCovariance(system, found.inverse, scale, found.xy.sigma,
-                                model.spread(options.reference))
+    if cover is not None:
+        lines = LinesCovariance(cover, (found.xy.sigma, found.theta.sigma))
         if wanted:
-            variance = np.stack(cover.diagonal())
+            variance = cover.of_stage
             if system.grid.n_sites <= MAX_SITES:
                 more = structured(model, cover)
                 variance = variance + more
@@ -293,13 +289,11 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if wanted and model.equations is not None:
             kept |= saved_terms(cover, model.equations.columns, measurements.sense,
-                               _beside_map(model, options, cover, measurements.sense))
+                                _beside_map(model, lines, measurements.sense))
             kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
                                   system.known_lines)
         if system.angular.n_views:
-            variance, closure = angular_variance(
-                cover, problem.conditions, sigma=(found.xy.sigma, found.theta.sigma),
-                half_width_m=length)
+            variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if wanted else u_theta
     known = system.known_sites
     field = np.where(known, found.field, complex(np.nan, np.nan))
@@ -314,20 +308,18 @@ def _error_map(measurements: Measurements, options: Options, *, model: ModelFit,
                     problem.conditions.datum), closure, kept
 
 
-def _beside_map(model: ModelFit, options: Options, cover: FieldCovariance,
-                sense: Sense) -> dict[str, np.ndarray]:
+def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[str, np.ndarray]:
     """Return what a unit of each coefficient makes of the plate, the lines and the microscope."""
     problem, columns = model.problem, cast(TermEquations, model.equations).columns
     system, length = problem.system, problem.half_width_m
     if system.grid.n_sites > MAX_FULL:
         return {}
-    both = BothCovariance(system, cover.inverse, options.reference, half_width_m=length,
-                          sigma_m=model.found.xy.sigma)
-    plates = both.maps_of_terms(cover.terms.fields, plates_of_terms(cover, columns.grid))[1].T
+    plates = cover.cover.maps_of_terms()[1].T
     lines = np.zeros((len(plates), 2, 0))
     if system.angular.n_views:
-        of_plate = lines_of_terms(cover, (columns.lines.at, columns.lines.values), length)
-        lines = np.stack([-cover.terms.turned, of_plate]).transpose(2, 0, 1) * length
+        stage, of_plate = cover.terms
+        of_plate = of_plate + stage[system.known_lines].mean(axis=0)
+        lines = np.stack([stage, of_plate]).transpose(2, 0, 1) * length
         if sense is Sense.PLATE_MOVES:
             lines[:, 0] = -lines[:, 0, -np.arange(lines.shape[2]) % lines.shape[2]]
     microscope = -length * np.array([[
@@ -338,7 +330,7 @@ def _beside_map(model: ModelFit, options: Options, cover: FieldCovariance,
             "lines": lines, "microscope": microscope}
 
 
-def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> ArtifactMap:
+def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:
     """Return the plate's map; `sigma_m` is the noise of a reading as it counts there."""
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
@@ -348,29 +340,15 @@ def _artifact_map(model: ModelFit, options: Options, sigma_m: float) -> Artifact
     u, sigma = float("nan"), found.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
     u_theta = np.full(system.angular.n_lines, np.nan)
-    if problem.direct and options.uncertainty is not False:
-        cover = FieldCovariance(system, found.inverse, scale_datum(system, alone, length),
-                                sigma, model.spread(alone))
-        u = float(np.sqrt(cover.scale_variance)) * sigma / length
-    if math.isfinite(u):
-        columns, lines = np.zeros((0, *problem.grid.y.shape), dtype=complex), NO_LINES
-        if model.equations is not None:
-            columns, lines = model.equations.columns.grid, model.equations.columns.lines
-        if all(isinstance(pose, LatticePose) for pose in problem.grid.poses):
-            of_plate = plate_covariance(cover, options.reference, columns=columns,
-                                        half_width_m=length, sigma_m=sigma)
-            variance = np.stack(of_plate.diagonal())
-            if system.grid.n_sites <= MAX_SITES:
-                variance = variance + image_variances(model, of_plate, plate=True)
-        else:
-            both = BothCovariance(system, found.inverse, options.reference, half_width_m=length,
-                                  sigma_m=sigma)
-            variance = np.stack(both.placed_diagonal(plates_of_terms(cover, columns), cover.terms))
-        u_x, u_y = (np.where(system.known_marks, np.sqrt(v) * sigma_m, np.nan) for v in variance)
+    if cover is not None:
+        u = float(np.sqrt(cover.variance_of_scale(alone))) * sigma / length
+    if cover is not None and math.isfinite(u):
+        variance = cover.of_plate
+        if system.grid.n_sites <= MAX_SITES and isinstance(system.grid.views, LatticeViews):
+            variance = variance + image_variances(model, cover, plate=True)
+        u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
-            u_theta = np.sqrt(angular_plate_variance(
-                cover, columns=columns, lines=(lines.at, lines.values),
-                sigma=(sigma, found.theta.sigma), half_width_m=length))
+            u_theta = np.sqrt(LinesCovariance(cover, (sigma, found.theta.sigma)).of_plate())
     return ArtifactMap(plate.real.copy(), plate.imag.copy(),
                        np.where(system.known_plate_lines, found.a_theta, np.nan),
                        scale / length, u, u_x, u_y, u_theta)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.covariance import FieldCovariance
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import NoiseEstimate
 from selfcal_ros.estimation.terms.columns import TermColumns
@@ -174,13 +174,13 @@ LEAST = 1e-12
 """Entries of a factor below this are dropped, in units of the noise."""
 
 
-def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense,
+def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
                 beside: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
     """Return the factors for `CalibrationResult.extra`; empty without terms, or for large fields.
 
     Parameters
     ----------
-    cover : FieldCovariance
+    cover : MapsCovariance
         Of the map, in the frame of the equations, terms included.
     columns : TermColumns
         The terms.
@@ -192,8 +192,8 @@ def saved_terms(cover: FieldCovariance, columns: TermColumns, sense: Sense,
     shape, beside = cover.system.grid.views.shape, beside or {}
     if cover.system.grid.n_sites > MAX_SITES:
         return {}
-    maps = cover.maps_of_terms().reshape(*shape, -1)
-    maps = np.where(cover.system.known_sites[..., None], maps, 0.0)
+    maps = cover.maps_of_terms()[0]
+    maps = maps.reshape(*shape, maps.shape[1])
     sign = 1
     if sense is Sense.PLATE_MOVES:  # G(X) = -H(-X), and L L' is the same for -L
         maps, sign = maps[::-1, ::-1], -1
@@ -256,13 +256,13 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
     return factors
 
 
-def angular_terms(cover: FieldCovariance, columns: TermColumns, sigma_m: float,
+def angular_terms(cover: MapsCovariance, columns: TermColumns, sigma_m: float,
                   known: np.ndarray) -> dict[str, Any]:
     """Return the contribution of each term of the lines to the angular map, for `extra`: rad, (K,).
 
     Parameters
     ----------
-    cover, columns : FieldCovariance, TermColumns
+    cover, columns : MapsCovariance, TermColumns
         As in `saved_terms`.
     sigma_m : float
         Noise of one grid reading, m.

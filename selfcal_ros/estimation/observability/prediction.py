@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Standard uncertainties predicted for a plan before measurement."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.angular import Conditions, conditions_for
-from selfcal_ros.estimation.datum.covariance import FieldCovariance
+from selfcal_ros.estimation.datum.angular import conditions_for, lines_alone
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum, rms
@@ -14,9 +14,6 @@ from selfcal_ros.model.readings import Sense
 
 MAX_SITES = 151 * 151
 """Largest field whose uncertainty map is predicted in full."""
-
-BLOCK = 512
-"""Number of unit vectors solved at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,50 +75,10 @@ def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
     n = 3 * system.grid.n_views
     inverse = np.zeros((system.size, system.size))
     inverse[:n, :n] = system.grid_inverse
-    ux, uy = (np.sqrt(v * repeats) for v in FieldCovariance(system, inverse).diagonal())
+    ux, uy = np.sqrt(MapsCovariance(system, inverse).of_stage * repeats)
     if not system.angular.n_views:
         return Prediction(ux, uy, np.zeros(0))
-    return Prediction(ux, uy, np.sqrt(repeats * theta_variance(system, artifact, datum)))
-
-
-def theta_variance(system: NormalEquations, artifact: Artifact, datum: ThetaDatum) -> np.ndarray:
-    """Return the variance of Gtheta (K,) for unit noise of one angular reading.
-
-    The rotations of the grid views are taken as known: the grid determines them thousands of times
-    better than the lines. So are the slopes behind the datum ``xy_axes``.
-    """
-    answer, inner, spread, conditions = _theta_parts(system, artifact, datum)
-    rows, gain = conditions.rows, conditions.gain
-    n = system.angular.n_lines
-    variance = np.einsum("ka,ab,kb->k", answer, inner, answer)
-    for start in range(0, n, BLOCK):
-        at = np.arange(start, min(start + BLOCK, n))
-        variance[at] += system.angular.solve(np.eye(n, len(at), -start))[at, at - start]
-    variance += np.einsum("kc,cd,kd->k", gain, rows @ spread, gain)
-    variance -= 2 * np.einsum("kc,kc->k", gain, spread)
-    return np.where(system.known_lines, np.maximum(variance, 0.0), np.nan)
-
-
-def theta_matrix(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
-                 sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
-    """Return the covariance (K, K) of `theta_variance`, in the frame of the equations."""
-    answer, inner, _, conditions = _theta_parts(system, artifact, datum, sense)
-    n = system.angular.n_lines
-    raw = system.angular.solve(np.eye(n)) + answer @ inner @ answer.T
-    datum_map = np.eye(n) - conditions.gain @ conditions.rows
-    return datum_map @ raw @ datum_map.T
-
-
-def _theta_parts(system: NormalEquations, artifact: Artifact, datum: ThetaDatum,
-                 sense: Sense = Sense.MICROSCOPE_MOVES
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Conditions]:
-    """Return the lines' response to free rotations, their covariance, and the datum's columns."""
-    angular = system.angular
-    half_width_m = artifact.grid_pitch_m * max(artifact.reach)
-    conditions = conditions_for(system, ThetaDatum(datum), sense, half_width_m)
-    free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
-    inner = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
-    answer = angular.response[:, free]
-    columns = np.ascontiguousarray(conditions.rows.T)
-    spread = angular.solve(columns) + answer @ inner @ (answer.T @ columns)
-    return answer, inner, spread, conditions
+    conditions = conditions_for(system, ThetaDatum(datum), Sense.MICROSCOPE_MOVES,
+                                artifact.grid_pitch_m * max(artifact.reach))
+    known = replace(conditions, slopes=np.zeros_like(conditions.slopes))
+    return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(known)[0]))

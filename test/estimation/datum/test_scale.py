@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.datum.covariance import scale_datum, scale_of
+from selfcal_ros.estimation.datum.scale import scale_of, scale_rows
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
@@ -26,11 +26,10 @@ def in_datum(system, field, parameters):
 
 @pytest.mark.parametrize("kind", ReferenceKind)
 def test_the_rows_give_the_change_of_the_scale(kind):
-    """Of a random free-network solution whose readings are all zero."""
+    """Of the maps of a random solution whose readings are all zero, in their datum."""
     system, rng = planned_system(PLAN.artifact, PLAN.views), np.random.default_rng(4)
     reference = reference_length(kind, 3e-6, 5e-7)
-    datum = scale_datum(system, reference, HALF_M)
-    assert datum.u_m == pytest.approx(5e-7 * HALF_M)
+    sites, marks = scale_rows(system, reference)
     none = np.zeros(system.grid.views.shape, dtype=complex)
     start = scale_of(system, reference, field=none, plate=none, half_width_m=HALF_M)
     assert start == pytest.approx((-1 if kind.of_plate else 1) * 3e-6 * HALF_M)
@@ -39,7 +38,7 @@ def test_the_rows_give_the_change_of_the_scale(kind):
         raw, parameters = raw * 1e-7, rng.normal(size=system.size) * 1e-7
         field, plate = in_datum(system, raw, parameters)
         found = scale_of(system, reference, field=field, plate=plate, half_width_m=HALF_M)
-        change = np.vdot(datum.rows, raw.ravel()).real + datum.parameters @ parameters
+        change = (np.vdot(sites, field.ravel()) + np.vdot(marks, plate.ravel())).real
         assert abs(change) > 1e-12
         assert found - start == pytest.approx(change, rel=1e-6)
 

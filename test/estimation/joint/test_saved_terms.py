@@ -19,8 +19,8 @@ def cover_of(field, known):
     """Return the covariance of a map that one coefficient moves by `field`, complex (nx, ny)."""
     grid = SimpleNamespace(n_sites=field.size, views=SimpleNamespace(shape=field.shape))
     return SimpleNamespace(
-        system=SimpleNamespace(grid=grid, known_sites=known),
-        maps_of_terms=lambda: field.reshape(-1, 1),
+        system=SimpleNamespace(grid=grid),
+        maps_of_terms=lambda: (np.where(known, field, 0.0).reshape(-1, 1), None),
         terms=SimpleNamespace(covariance=np.array([[SIGMA**2]])))
 
 

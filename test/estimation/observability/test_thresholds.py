@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability.prediction import predict, theta_variance
+from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -64,7 +64,7 @@ def test_the_prediction_for_lines_counts_the_repeats_of_each_view(repeats):
     plan = hu_plan(Artifact(5, 0.01, 12))
     views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
     system = planned_system(plan.artifact, views)
-    found = theta_variance(system, plan.artifact, ThetaDatum.ZERO_MEAN)
+    found = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN).u_theta**2
     wanted = dense_theta([0, 3, 1, 0], repeats, [2], 12)
     assert found == pytest.approx(wanted, rel=1e-9)
     as_unit = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN, repeats=min(repeats))
