@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.comparison.maps import Significance, significance
+from selfcal_ros.estimation.comparison.maps import Significance, significance, without
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.error_map import MANY_DOF
 
@@ -127,14 +127,6 @@ def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray,
         if np.linalg.norm(rest) > INDEPENDENT:
             found.append(rest / np.linalg.norm(rest))
     return q, np.stack(found, axis=1) if found else np.zeros((len(removed), 0))
-
-
-def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the covariance of values from which the columns q were removed; (d,) as variances."""
-    if covariance.ndim == 1:
-        return covariance * (1 - (q**2).sum(axis=1))
-    covariance = covariance - q @ (q.T @ covariance)
-    return covariance - (covariance @ q) @ q.T
 
 
 def _diagonal(covariance: np.ndarray) -> np.ndarray:

@@ -100,12 +100,8 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
     if not np.isfinite(total).all() or not total.any():
         return None
     q = np.linalg.qr(removed)[0]
-    if correlated:
-        total = total - q @ (q.T @ total)
-        total = total - (total @ q) @ q.T
-        variance = np.diag(total).copy()
-    else:
-        variance = total * (1 - (q**2).sum(axis=1))
+    total = without(total, q)
+    variance = np.diag(total).copy() if correlated else total
     good = variance > NO_VARIANCE * variance.max()
     z = values[good] / np.sqrt(variance[good])
     if correlated:
@@ -119,6 +115,14 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
     p_z, limit = _of_largest(largest, len(z), root, noise_dof)
     return Significance(square / dof, dof, p, correlated, largest, limit, p_z, noise_dof,
                         min(p, p_z) < DIFFERENCE_LEVEL / 2)
+
+
+def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the covariance of values from which the columns q were removed; (d,) as variances."""
+    if covariance.ndim == 1:
+        return covariance * (1 - (q**2).sum(axis=1))
+    covariance = covariance - q @ (q.T @ covariance)
+    return covariance - (covariance @ q) @ q.T
 
 
 def _mahalanobis(z: np.ndarray, correlation: np.ndarray) -> tuple[float, float, np.ndarray]:

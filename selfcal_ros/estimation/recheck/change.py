@@ -18,6 +18,7 @@ from selfcal_ros.estimation.comparison.maps import (
     Significance,
     joint_dof,
     significance,
+    without,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.comparison.together import Together, together
@@ -273,9 +274,7 @@ def scale_row(modes: np.ndarray) -> np.ndarray:
 
 def _u_without(cover: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Return standard uncertainties after the least-squares parts in a basis are taken off."""
-    q = np.linalg.qr(basis)[0]
-    left = cover - q @ (q.T @ cover)
-    return np.sqrt(np.maximum(np.diag(left - (left @ q) @ q.T), 0.0))
+    return np.sqrt(np.maximum(np.diag(without(cover, np.linalg.qr(basis)[0])), 0.0))
 
 
 def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
