@@ -9,7 +9,7 @@ solves the same factored equations (Gauss-Newton).
 """
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +34,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest
-from selfcal_ros.estimation.terms.visits import without_noise
+from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
 from selfcal_ros.model.terms import OF_PLATE, TermName
 
 MAX_STEPS = 100
@@ -110,6 +110,19 @@ class ModelFit:
         if self.equations is None:
             return np.zeros((0, 0))
         return self.equations.inverse(self.found.xy.sigma)
+
+    def visits_about_means(self) -> Iterator[tuple[int, ViewVisits, np.ndarray]]:
+        """Yield row and visits of each view, and what they have more than the means of their marks.
+
+        Complex (V,), plate frame, m, without the terms.
+        """
+        known = [] if self.equations is None else self.equations.columns.at_visits(
+            self.coefficients)
+        for row, visits in enumerate(self.problem.ground.visits):
+            if visits is not None:
+                y = visits.y - (known[row] if known else 0.0)
+                yield row, visits, visits.about_means(
+                    y[None], self.problem.system.grid.n_marks)[0]
 
     @property
     def spread(self) -> TermSpread | None:

@@ -35,13 +35,10 @@ def axis_contrast(model: ModelFit) -> float:
     By the repeats, or by the residuals if there are few. 0 unless the noises differ (F-test).
     """
     problem = model.problem
-    known = [] if model.equations is None else model.equations.columns.at_visits(
-        model.coefficients)
     squares, dof = np.zeros(2), 0.0
-    for row, visits in enumerate(problem.ground.visits):
-        if visits is not None and visits.repeated:
-            y = visits.y - (known[row] if known else 0.0)
-            rest = visits.about_means(y[None], problem.system.grid.n_marks)[0] / visits.phase
+    for _, visits, rest in model.visits_about_means():
+        if visits.repeated:
+            rest = rest / visits.phase
             squares += visits.weight @ np.stack([rest.real, rest.imag], axis=1) ** 2
             dof += len(visits.mark) - len(np.unique(visits.mark))
     if 2 * dof < MIN_REPEAT_DOF:
@@ -198,14 +195,6 @@ def correlated_variances(model: ModelFit, cover: MapsCovariance, correlation: np
 
 def _by_time(model: ModelFit) -> list[tuple[int, ViewVisits, np.ndarray, np.ndarray]]:
     """Return row, visits, their order and weighted residuals of views with repeated visits."""
-    known = [] if model.equations is None else model.equations.columns.at_visits(
-        model.coefficients)
-    found = []
-    for row, visits in enumerate(model.problem.ground.visits):
-        if visits is None or not visits.repeated:
-            continue
-        y, residual = visits.y - (known[row] if known else 0.0), model.found.residuals[row]
-        rest = visits.about_means(y[None], residual.size)[0] + residual.reshape(-1)[visits.mark]
-        found.append((row, visits, np.argsort(visits.time, kind="stable"),
-                      np.sqrt(visits.weight) * rest))
-    return found
+    return [(row, visits, np.argsort(visits.time, kind="stable"),
+             np.sqrt(visits.weight) * (rest + model.found.residuals[row].reshape(-1)[visits.mark]))
+            for row, visits, rest in model.visits_about_means() if visits.repeated]

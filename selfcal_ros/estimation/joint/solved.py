@@ -92,7 +92,9 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         return {}
     starts = [int(v.visits.stamp_ns.min()) for v in measurements.views
               if v.visits is not None and len(v.visits.stamp_ns)]
-    views = []
+    views, at_visits = [], {
+        row: (rest + found.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
+        for row, visits, rest in model.visits_about_means()}
     for index, view in enumerate(measurements.views):
         entry: dict[str, Any] = {"view": view.view.name}
         if index in problem.grid.index:
@@ -101,27 +103,13 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
             rest = np.where(read, found.residuals[row], np.nan) * problem.to_stage[row]
             entry |= {"dx": np.round(rest.real, DECIMALS_M), "dy": np.round(rest.imag, DECIMALS_M)}
             if starts and view.visits is not None and len(view.visits.mark):
-                entry["course"] = _course(view.visits, _at_visits(model, row), min(starts))
+                entry["course"] = _course(view.visits, at_visits[row], min(starts))
         if index in problem.angular.index:
             row = problem.angular.index.index(index)
             rest = np.where(problem.angular.weight[row] > 0, found.residuals_theta[row], np.nan)
             entry["dtheta"] = np.round(rest, DECIMALS_RAD)
         views.append(entry)
     return {RESIDUALS: {"views": views}}
-
-
-def _at_visits(model: ModelFit, row: int) -> np.ndarray:
-    """Return the residual of every visit of a grid view, complex (V,), stage axes, m."""
-    problem = model.problem
-    visits = problem.ground.visits[row] if problem.ground else None
-    if visits is None:
-        return np.zeros(0, dtype=complex)
-    values = visits.y
-    if model.equations is not None:
-        values = values - model.equations.columns.at_visits(model.coefficients)[row]
-    rest = model.found.residuals[row].reshape(-1)
-    residual = visits.about_means(values[None], rest.size)[0] + rest[visits.mark]
-    return residual * problem.to_stage[row]
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:

@@ -13,6 +13,7 @@ from scipy.special import eval_legendre, fdtrc
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
+from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, FLOOR_M, Explanation
@@ -36,8 +37,9 @@ SURE = 3.0
 CHECKED = 1e-6
 """Smallest share of a reading's error in its own residual: the part that other readings check."""
 
-Sized = tuple[float, float, dict[str, Any]]
-"""Value and u of the most significant component, and further fields of the cause."""
+Options = Iterable[tuple[dict[str, Any], np.ndarray]]
+"""Combinations of the coefficients, the most significant of which sizes a cause: the further fields
+of that cause, and the weights of the coefficients."""
 
 
 def cause_of(found: Explanation, ground: TermInputs) -> Cause:
@@ -51,7 +53,9 @@ def cause_of(found: Explanation, ground: TermInputs) -> Cause:
         Of the fit: names of the views, unit of a slip's rotation.
     """
     names = ground.names_of(found.name)
-    value, u, fields = _SIZES[found.name](found, names, ground.half_width_m)
+    options = list(_OPTIONS[found.name](found, names, ground.half_width_m))
+    fields, value, u = max(((fields, *_linear(found, weights)) for fields, weights in options),
+                           key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300))
     unit = UNITS.get(found.name, "m")
     largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
     return Cause(**{"name": found.name, "size": value, "u": u, "unit": unit, "p": found.p,
@@ -92,14 +96,13 @@ def scatter_of_views(model: ModelFit, measurements: Measurements
 
     If marks were visited again, from the visits after subtraction of the fitted terms.
     """
-    held, out = model.equations, []
-    known = [] if held is None else held.columns.at_visits(model.coefficients)
+    out, again = [], {row: (visits, rest) for row, visits, rest in model.visits_about_means()
+                      if model.equations is not None and visits.repeated}
     for row, index in enumerate(model.problem.grid.index):
-        view, visits = measurements.views[index], model.problem.ground.visits[row]
+        view = measurements.views[index]
         sigma, dof = view.sigma_xy, float(view.dof_xy)
-        if visits is not None and visits.repeated and known:
-            n_marks = model.problem.system.grid.n_marks
-            rest = visits.about_means((visits.y - known[row])[None], n_marks)[0]
+        if row in again:
+            visits, rest = again[row]
             dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
             sigma = float(np.sqrt(visits.weight @ abs(rest) ** 2 / dof))
         if dof > 0 and np.isfinite(sigma):
@@ -134,27 +137,27 @@ def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
     return float(weights @ found.values), math.sqrt(max(variance, 0.0))
 
 
-def _likeliest[What](found: Explanation, options: list[tuple[What, np.ndarray]],
-                     ) -> tuple[What, float, float]:
-    """Return key, value and u of the most significant combination."""
-    sized = [(what, *_linear(found, weights)) for what, weights in options]
-    return max(sized, key=lambda item: abs(item[1]) / max(item[2], 1e-300))
+def _each(found: Explanation, fields: Callable[[Column], dict[str, Any]]) -> Options:
+    """Yield every coefficient."""
+    for column, row in zip(found.columns, np.eye(len(found.columns)), strict=True):
+        yield fields(column), row
 
 
-def _one_column(found: Explanation) -> tuple[str, float, float]:
-    """Return component, value and u of the most significant coefficient."""
-    return _likeliest(found, [(column.component, row) for column, row in zip(
-        found.columns, np.eye(len(found.columns)), strict=True)])
+def _microscope(found: Explanation, *_: object) -> Options:
+    return _each(found, lambda column: {
+        "unit": "rad" if column.component in ("turn", "shear") else "m/m",
+        "details": {"part": column.component}})
 
 
-def _microscope(found: Explanation, *_: object) -> Sized:
-    part, value, u = _one_column(found)
-    return value, u, {"unit": "rad" if part in ("turn", "shear") else "m/m",
-                      "details": {"part": part}}
+def _approach(found: Explanation, *_: object) -> Options:
+    return _each(found, lambda column: {"axis": column.component})
 
 
-def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    options: list[tuple[tuple[str, str], np.ndarray]] = []
+def _yaw(found: Explanation, *_: object) -> Options:
+    return (({}, row * np.sign(found.values)) for _, row in _each(found, lambda column: {}))
+
+
+def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Options:
     for view in sorted({column.view for column in found.columns}):
         for axis in "xy":
             shape = np.array([
@@ -162,78 +165,62 @@ def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
                 if c.view == view and c.component[0] == axis else 0 * TIMES
                 for c in found.columns])
             path = found.values @ shape
-            ends = shape[:, int(path.argmax())] - shape[:, int(path.argmin())]
-            options.append(((names[view], axis), ends))
-    (name, axis), value, u = _likeliest(found, options)
-    return value, u, {"view": name, "axis": axis}
+            yield {"view": names[view], "axis": axis}, (
+                shape[:, int(path.argmax())] - shape[:, int(path.argmin())])
 
 
-def _of_plate(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    """Size the coefficient that differs most significantly from that of the first view.
+def _of_plate(found: Explanation, names: tuple[str, ...], _: float) -> Options:
+    """Yield the differences of the coefficients from those of the first view.
 
     If the term is free, the first view has no coefficients of its own: they are 0.
     """
-    weights = np.eye(len(found.columns))
-    for at, column in enumerate(found.columns):
-        weights[at] -= [c.view == 0 and c.component == column.component for c in found.columns]
-    column, value, u = _likeliest(found, [(column, row) for column, row in zip(
-        found.columns, weights, strict=True) if row.any()])
-    return value, u, {"view": names[column.view],
-                      "details": {"against": names[0], "part": column.component}}
+    for column, row in zip(found.columns, np.eye(len(found.columns)), strict=True):
+        row -= [c.view == 0 and c.component == column.component for c in found.columns]
+        if row.any():
+            yield {"view": names[column.view],
+                   "details": {"against": names[0], "part": column.component}}, row
 
 
-def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    options: list[tuple[int, np.ndarray]] = []
+def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> Options:
     for view in sorted({column.view for column in found.columns}):
         mine = np.array([column.view == view for column in found.columns])
         size = float(np.hypot.reduce(found.values[mine]))
-        options.append((view, np.where(mine, found.values, 0.0) / (size or 1.0)))
-    view, value, u = _likeliest(found, options)
-    return value, u, {"view": names[view]}
+        yield {"view": names[view]}, np.where(mine, found.values, 0.0) / (size or 1.0)
 
 
-def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    """Size the view that differs most from all others: a common rotation belongs to the datum."""
+def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Options:
+    """Yield the view that differs most from all others: a common rotation belongs to the datum."""
     n, unit = len(found.values), np.eye(len(found.values))
     apart = []
     for at in range(n):
         pairs = [_linear(found, unit[at] - unit[other]) for other in range(n) if other != at]
         apart.append(min((abs(value) / max(u, 1e-300) for value, u in pairs), default=0.0))
     at = int(np.argmax(apart))
-    value, u = _linear(found, unit[at] - (1 - unit[at]) / max(n - 1, 1))
-    u = max(u, abs(value) / max(apart[at], 1e-300))  # that of the difference from the nearest
-    return value, u, {"view": names[found.columns[at].view]}
+    weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
+    value, u = _linear(found, weights)
+    # u is that of the difference from the nearest
+    yield {"view": names[found.columns[at].view],
+           "u": max(u, abs(value) / max(apart[at], 1e-300))}, weights
 
 
-def _yaw(found: Explanation, *_: object) -> Sized:
-    value, u = _one_column(found)[1:]
-    return abs(value), u, {}
-
-
-def _approach(found: Explanation, *_: object) -> Sized:
-    axis, value, u = _one_column(found)
-    return value, u, {"axis": axis}
-
-
-def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Sized:
-    toward = found.values / np.hypot(*found.values)
+def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Options:
     if found.mark is None:
         raise ValueError("a reading without its mark")
-    return *_linear(found, toward), {"view": names[found.columns[0].view], "mark": found.mark}
+    yield {"view": names[found.columns[0].view], "mark": found.mark}, (
+        found.values / np.hypot(*found.values))
 
 
-def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Sized:
+def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Options:
     order = {column.component: i for i, column in enumerate(found.columns)}
     x, y, phi = (float(found.values[order[part]]) for part in ("x", "y", "phi"))
     size = math.hypot(x, y)
     toward = np.zeros(3)
     toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
-    return *_linear(found, toward), {
-        "view": names[found.columns[0].view],
-        "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m}}
+    yield {"view": names[found.columns[0].view],
+           "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m}}, toward
 
 
-_SIZES: dict[str, Callable[..., Sized]] = {
+_OPTIONS: dict[str, Callable[..., Options]] = {
     TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _of_plate,
     TermName.PLATE_SHAPE: _of_plate, TermName.APPROACH: _approach, SLIP: _slip,
     READING: _reading, TermName.PLATE_STRAIN: _of_plate,
