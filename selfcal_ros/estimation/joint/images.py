@@ -346,9 +346,7 @@ def _solved(system: NormalEquations,
     grid = system.grid
     y = np.zeros(grid.read.shape, dtype=complex)
     y[grid.read] = values
-    free, d = grid.reduced(y)
-    alone = system.grid_inverse @ d
-    field = (free - grid.response @ alone).reshape(grid.views.shape)
+    field, alone = system.alone(y)
     plate, residual = grid.plate(y, field, alone)
     moved = np.zeros(system.size)
     moved[:len(alone)] = alone

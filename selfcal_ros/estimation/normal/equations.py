@@ -130,6 +130,12 @@ class NormalEquations:
                            else _spectrum(self.grid.schur))
         return pseudo_inverse(values, vectors, self.grid_scale)
 
+    def alone(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return map and misalignments of grid readings `y` fitted alone, in no datum."""
+        free, d = self.grid.reduced(y)
+        parameters = self.grid_inverse @ d
+        return (free - self.grid.response @ parameters).reshape(self.grid.views.shape), parameters
+
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
@@ -326,11 +332,7 @@ def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.
 
 def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     """Return the residuals of the grid readings `y` (views, nx, ny), fitted alone."""
-    grid = system.grid
-    free, d = grid.reduced(y)
-    parameters = system.grid_inverse @ d
-    field = (free - grid.response @ parameters).reshape(grid.views.shape)
-    return grid.plate(y, field, parameters)[1]
+    return system.grid.plate(y, *system.alone(y))[1]
 
 
 def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:

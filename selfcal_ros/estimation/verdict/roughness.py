@@ -245,10 +245,8 @@ def _apart(one: ModelFit, other: ModelFit) -> np.ndarray:
 def _alone(model: ModelFit, at: np.ndarray) -> np.ndarray:
     """Return the map of the marks alone at places, in no particular datum, complex (P,), m."""
     system = _of_marks(model)
-    free, d = system.grid.reduced(model.y)
-    field = free - system.grid.response @ (system.grid_inverse @ d)
     spline = system.grid.views.spline
-    return spline.rows(at) @ spline.coefficients(field.reshape(spline.shape)).ravel()
+    return spline.rows(at) @ spline.coefficients(system.alone(model.y)[0]).ravel()
 
 
 def _rigid(at: np.ndarray) -> np.ndarray:
