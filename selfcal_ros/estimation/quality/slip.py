@@ -22,8 +22,7 @@ from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
-from selfcal_ros.estimation.terms.columns import Column, TermColumns
-from selfcal_ros.estimation.terms.shapes import WithinMarks, shapes_of
+from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder, TermColumns
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.causes import cause_of
 from selfcal_ros.estimation.verdict.explanations import find_explanations
@@ -274,8 +273,9 @@ def slip_at_line(ground: TermInputs, row: int, slip: Slip, phase: complex) -> Te
     axis = "mn".index(slip.axis)
     line = np.indices(ground.z.shape)[axis] - half[axis]
     after = (line >= slip.first) & (ground.weight[row] > 0)
-    shapes = shapes_of([{row: (after * shape).reshape(-1)} for shape in (phase, ground.z)],
-                       (0, 0, 1), (1, 1j, 1j), ground.weight)
-    columns = tuple(Column(SLIP, row, part, np.inf) for part in ("x", "y", "phi"))
-    nothing = WithinMarks(np.zeros((3, 3)), np.zeros(3), 0.0, 0)
-    return TermColumns(columns, shapes, nothing, [[None] * len(ground.names)] * 2)
+    made, nowhere = ColumnBuilder(), [None] * len(ground.names)
+    for form, parts in ((phase, (("x", 1), ("y", 1j))), (ground.z, (("phi", 1j),))):
+        shape = made.add({row: (after * form).reshape(-1)}, [*nowhere])
+        for part, unit in parts:
+            made.column(Column(SLIP, row, part, np.inf), shape, unit)
+    return made.done(ground)

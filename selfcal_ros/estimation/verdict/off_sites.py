@@ -18,10 +18,10 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.terms.columns import (
     AXES,
     Column,
+    ColumnBuilder,
     TermColumns,
     columns_from,
 )
-from selfcal_ros.estimation.terms.shapes import WithinMarks, shapes_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.verdict import Cause
@@ -68,19 +68,16 @@ def reading_columns(ground: TermInputs, residuals: np.ndarray,
     largest = np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]
     at = [place for place in zip(*np.unravel_index(largest, squares.shape), strict=True)
           if squares[place] >= 0]
-    means, columns, found = [], [], []
+    made, found = ColumnBuilder(), []
     for number, (view, i, j) in enumerate(at):
         mean = np.zeros(squares.shape[1:], dtype=complex)
         mean[i, j] = phases[view]
-        means.append({int(view): mean.reshape(-1)})
-        columns += [Column(READING, int(view), axis, np.inf) for axis, _ in AXES]
+        shape = made.add({int(view): mean.reshape(-1)}, [None] * len(ground.names))
+        for axis, unit in AXES:
+            made.column(Column(READING, int(view), axis, np.inf), shape, unit)
         rows = np.arange(2 * len(at)) // 2 == number
         found.append(Suspect(int(view), (int(i), int(j)), rows))
-    n, units = 2 * len(at), [unit for _, unit in AXES]
-    shapes = shapes_of(means, [column // 2 for column in range(n)], units * len(at), ground.weight)
-    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), 0.0, 0)
-    return TermColumns(tuple(columns), shapes, nothing, [[None] * len(ground.names)] * len(at)
-                       ), found
+    return made.done(ground), found
 
 
 SLIP = "slip"
