@@ -23,6 +23,7 @@ from selfcal_ros.estimation.comparison.runs import (
     require_own_readings,
     shared_reference,
 )
+from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -244,7 +245,7 @@ def _result(parts: Sequence[Part], first: CalibrationResult, xy: tuple[np.ndarra
     g_theta, u_theta = (_filled(nothing if angular is None else part, lines if angular else
                                 np.zeros_like(lines)) for part in (
         (nothing, nothing) if angular is None else (angular.values, angular.u)))
-    o, r = _first_order(first.artifact.x_m[known], first.artifact.y_m[known], mean.values)
+    o, r = first_order(first.artifact, gx + 1j * gy)
     emap = ErrorMap(first.artifact, gx, gy, u_gx, u_gy, g_theta, u_theta, o, r,
                     ThetaDatum.ZERO_MEAN)
     unknown = np.full(plate.shape, np.nan)
@@ -271,16 +272,6 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     out = np.full(known.shape, np.nan)
     out[known] = values
     return out
-
-
-def _first_order(x: np.ndarray, y: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Return O and R: the least-squares coefficients of Gx = O y + R x, Gy = O x - R y (Hu 6)."""
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    columns = [(y, x), (x, -y), (one, zero), (zero, one), (-y, x), (x, y)]
-    basis = np.array([np.concatenate(column) for column in columns]).T
-    size = np.linalg.norm(basis, axis=0)
-    found = np.linalg.lstsq(basis / size, values, rcond=None)[0] / size
-    return float(found[0]), float(found[1])
 
 
 def _extra(parts: Sequence[Part], xy: tuple[np.ndarray, Mean],

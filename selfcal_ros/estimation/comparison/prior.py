@@ -17,8 +17,8 @@ from scipy.linalg import cho_factor, cho_solve, null_space
 from scipy.special import chdtri, fdtrc
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.solved import KEY, factors_of
-from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import PRIORS
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
@@ -250,10 +250,9 @@ def with_prior(result: CalibrationResult, covariance: Covariance) -> Calibration
                              **{name: getattr(emap, name) for name in (*MAPS, *FIRST_ORDER)}}
     g = _on_nodes(gain @ field.values, known)
     u = _on_nodes(np.sqrt(np.diag(after)), known)
-    z = (emap.artifact.x_m + 1j * emap.artifact.y_m) / pitch_m
-    o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(g[0] + 1j * g[1]))
-    now = replace(emap, gx=g[0], gy=g[1], u_gx=u[0], u_gy=u[1], nonorthogonality=o / pitch_m,
-                  scale_difference=r / pitch_m)
+    o, r = first_order(emap.artifact, g[0] + 1j * g[1])
+    now = replace(emap, gx=g[0], gy=g[1], u_gx=u[0], u_gy=u[1], nonorthogonality=o,
+                  scale_difference=r)
     result = replace(result, extra={**result.extra, PRIOR: facts})
     told = np.diag(gain @ field.covariance @ gain.T)
     return replace(

@@ -23,9 +23,9 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
+from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
-from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
@@ -230,11 +230,8 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     found = result.artifact_map
     artifact = replace(result.plate, map_grid=None, harmonics=0)
     nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
-    z = (artifact.x_m + 1j * artifact.y_m) / artifact.grid_pitch_m
-    known = np.isfinite(found.ax + found.ay)
-    o, r = Gauge(z, known, scale=True).first_order(found.ax + 1j * found.ay)
+    o, r = first_order(artifact, found.ax + 1j * found.ay)
     u_x, u_y, u_theta = (u if u.size else empty for u, empty in (
         (found.u_ax, nothing), (found.u_ay, nothing), (found.u_a_theta, none)))
     return replace(result, placed_plate=None, error_map=ErrorMap(
-        artifact, found.ax, found.ay, u_x, u_y, found.a_theta, u_theta,
-        o / artifact.grid_pitch_m, r / artifact.grid_pitch_m))
+        artifact, found.ax, found.ay, u_x, u_y, found.a_theta, u_theta, o, r))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scale of the maps from a reference length.
+"""The scale of the maps from a reference length, and the first-order terms that have no datum.
 
 No view determines the magnification: G = s z, A = -s m with offsets to match changes no reading.
 With a reference the maps in their datum (no scale) become G + c z and A - c m, with c such that the
@@ -12,6 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
+from selfcal_ros.model.artifact import Artifact
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
@@ -64,3 +65,10 @@ def _slope(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
     along, unit = (z.real, 1) if kind is ReferenceKind.STAGE_X else (z.imag, 1j)
     centred = np.where(known, along - along[known].mean(), 0.0)
     return (unit * centred / (centred**2).sum()).ravel()
+
+
+def first_order(artifact: Artifact, field: np.ndarray) -> tuple[float, float]:
+    """Return O and R (Hu eq. 6) of a map, complex (nx, ny), m; NaN where it is unknown."""
+    z, pitch_m = artifact.x_m + 1j * artifact.y_m, artifact.grid_pitch_m
+    o, r = Gauge(z / pitch_m, np.isfinite(field), scale=True).first_order(field)
+    return o / pitch_m, r / pitch_m

@@ -23,7 +23,7 @@ from selfcal_ros.estimation.datum.angular import (
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.datum.scale import scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
-from selfcal_ros.estimation.joint.fit import JointFit, noise_gain
+from selfcal_ros.estimation.joint.fit import noise_gain
 from selfcal_ros.estimation.joint.images import image_noise, kept_images
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
@@ -177,7 +177,9 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         axes = misclosure_test(found.misclosure, closure)
     result = CalibrationResult(
         measurements.plan_id, error_map, artifact_map,
-        _views(measurements, problem, found), seen, noise_of(found.xy, found.theta),
+        views_of(measurements, problem, np.where(
+            problem.system.known_views, found.parameters, np.nan)), seen,
+        noise_of(found.xy, found.theta),
         measurements.all_rejected(), findings=findings, method="joint",
         sense=str(measurements.sense),
         extra={"solver": found.solver, **kept, **_kept_images(measurements, model),
@@ -354,15 +356,16 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
                        scale / length, u, u_x, u_y, u_theta)
 
 
-def _views(measurements: Measurements, problem: Problem, found: JointFit) -> tuple[ViewResult, ...]:
+def views_of(measurements: Measurements, problem: Problem,
+             parameters: np.ndarray) -> tuple[ViewResult, ...]:
+    """Return the results of the views for all misalignments, m, (size,); NaN where unknown."""
     system = problem.system
-    values = np.where(system.known_views, found.parameters, np.nan)
-    phi = dict(zip(system.angular_index, values[system.phi_at], strict=True))
+    phi = dict(zip(system.angular_index, parameters[system.phi_at], strict=True))
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
-        phi[i] = values[3 * row] + problem.turn_rad[row] * problem.half_width_m
+        phi[i] = parameters[3 * row] + problem.turn_rad[row] * problem.half_width_m
         turn = problem.grid.poses[row].phase * np.exp(1j * problem.turn_rad[row])
-        offset[i] = turn * complex(*values[3 * row + 1:3 * row + 3])
+        offset[i] = turn * complex(*parameters[3 * row + 1:3 * row + 3])
     nan = complex(np.nan, np.nan)
     return tuple(
         ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m,

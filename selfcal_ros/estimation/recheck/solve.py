@@ -11,6 +11,7 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -23,9 +24,8 @@ from selfcal_ros.estimation.joint.problem import (
     repeats_of,
     turned,
 )
-from selfcal_ros.estimation.joint.solve import weights_read
+from selfcal_ros.estimation.joint.solve import views_of
 from selfcal_ros.estimation.joint.solved import noise_of
-from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -56,7 +56,7 @@ from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, Sense
-from selfcal_ros.model.result import CalibrationResult, Noise, Observability, ViewResult
+from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 
@@ -101,13 +101,11 @@ class Rechecked:
         variance = np.sum(list(new.variances(plate).values()), axis=0).reshape(xy.shape)
         (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan)
                                 for values in (xy, np.sqrt(variance)))
-        length = artifact.grid_pitch_m * max(artifact.reach)
-        z = (artifact.x_m + 1j * artifact.y_m) / length
-        o, r = Gauge(z, known, scale=True).first_order(np.nan_to_num(gx + 1j * gy))
+        o, r = first_order(artifact, gx + 1j * gy)
         theta = self.lines.values
         u_theta = np.where(np.isfinite(theta), np.sqrt(np.diag(self.lines.covariance(plate))),
                            np.nan)
-        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o / length, r / length,
+        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r,
                         ThetaDatum.ZERO_MEAN)
 
 
@@ -150,10 +148,13 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     failed = (other,) if other is not None else _misfit(
         seen, dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
     found["passes"] = min(view.view.repeats for view in measurements.views)
-    before = plate.result.verdict
+    before, problem = plate.result.verdict, readings.problem
+    of_views = np.pad(seen.parameters, (0, problem.system.size - len(seen.parameters)),
+                      constant_values=np.nan)
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
-        _views(readings, seen), _observability(readings, seen), noise, measurements.all_rejected(),
+        views_of(measurements, problem, of_views), _observability(readings, seen), noise,
+        measurements.all_rejected(),
         findings=() if failed else _findings(found),
         sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
@@ -329,23 +330,6 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
     return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
                    k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
-
-
-def _views(readings: PlateReadings, seen: Seen) -> tuple[ViewResult, ...]:
-    problem, nan, out = readings.problem, float("nan"), []
-    for index, one in enumerate(readings.measurements.views):
-        phi = tx = ty = nan
-        if index in problem.grid.index:
-            row = problem.grid.index.index(index)
-            values = seen.parameters[3 * row:3 * row + 3]
-            turn = problem.grid.poses[row].phase * np.exp(1j * problem.turn_rad[row])
-            offset = turn * complex(*values[1:])
-            phi = float(values[0] / problem.half_width_m + problem.turn_rad[row])
-            tx, ty = offset.real, offset.imag
-        out.append(ViewResult(one.view.name, one.view.rotation_rad, *one.view.translation_m, phi,
-                              tx, ty, one.used, sum(one.rejected.values()),
-                              **weights_read(problem, index)))
-    return tuple(out)
 
 
 def _observability(readings: PlateReadings, seen: Seen) -> Observability:
