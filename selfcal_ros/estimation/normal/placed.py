@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csr_matrix, diags, identity
+from scipy.sparse import csr_matrix, diags
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
@@ -178,38 +178,23 @@ class PlacedEquations(NormalEquations):
             if known.sum() < 3:
                 return np.zeros(views.shape, dtype=bool)
             datum = Gauge(views.z_sites, known, scale=True)
-            nodes = identity(self.grid.n_sites, format="csr")
-            largest = np.maximum(*self.variance(
-                nodes, datum.orthonormal, inverse, everywhere=datum.everywhere))
+            largest = np.maximum(*self._variances(datum, inverse))
             known = some & (largest.reshape(views.shape) < KNOWN**2)
         return known
 
-    def variance(self, rows: csr_matrix, rigid: np.ndarray, inverse: np.ndarray, *,
-                 everywhere: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances of Gx and Gy at places, in a datum over some of them, unit noise.
+    def _variances(self, datum: Gauge, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of Gx and Gy at the nodes in a datum over some, unit noise.
 
-        Parameters
-        ----------
-        rows : sparse matrix (P, n)
-            From the unknowns of the map to the places.
-        rigid : complex array (P, 4)
-            Datum modes at the places of the datum, 0 at others, orthonormal (real inner product).
-        inverse : float array (size, size)
-            Covariance of the misalignments.
-        everywhere : complex array (P, 4), optional
-            The same modes at all places, if some are not of the datum.
+        `inverse` is the covariance of the misalignments, (size, size).
         """
-        n = 3 * self.grid.n_views
-        solved = rows @ self.grid.factor.inverse
-        response, own = rows @ self.grid.response, inverse[:n, :n]
-        spread = solved @ (rows.T @ rigid) + response @ (
+        n, rigid = 3 * self.grid.n_views, datum.orthonormal
+        factor, response, own = self.grid.factor, self.grid.response, inverse[:n, :n]
+        spread = factor.inverse @ rigid + response @ (
             own @ np.real(response.conj().T @ rigid))
-        inner = np.real(rigid.conj().T @ spread)
-        common, out = np.asarray(rows.multiply(solved.real).sum(axis=1)).ravel(), []
-        modes = rigid if everywhere is None else everywhere
+        inner, out = np.real(rigid.conj().T @ spread), []
         for part in (np.real, np.imag):
-            b, s, y = part(modes), part(spread), part(response)
-            out.append(common + np.einsum("pa,pa->p", y @ own, y)
+            b, s, y = part(datum.everywhere), part(spread), part(response)
+            out.append(factor.inverse_diagonal() + np.einsum("pa,pa->p", y @ own, y)
                        + np.einsum("pk,pk->p", b @ inner - 2 * s, b))
         return out[0], out[1]
 
