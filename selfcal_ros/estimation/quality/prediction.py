@@ -211,8 +211,6 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     own = noise_of(rng, (n, *weight.shape), weight)
     own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
     views = maps_of(grid.views.plate_shape, held.grid.poses)
-    unknown = [None if fitted >= 0 else ViewMisalignment(views.z, known[row])
-               for row, fitted in enumerate(held.rows)]
     squares = np.zeros(n)
     step = max(TOGETHER // grid.weight.size, 1)
     for draws in (slice(first, first + step) for first in range(0, n, step)):
@@ -227,9 +225,13 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
             error = error - _of_terms(coefficients[:, draws], held.columns)
         if len(held.own):
             error = error + _of_terms(own_terms[:, draws], held.own)
-        for row, (fitted, misalignment) in enumerate(zip(held.rows, unknown, strict=True)):
-            error[:, row] -= (misaligned[:, fitted] if misalignment is None else
-                              np.array([misalignment.of(one) for one in error[:, row]]))
+        for row, fitted in enumerate(held.rows):
+            if fitted >= 0:
+                error[:, row] -= misaligned[:, fitted]
+                continue
+            z, here = views.z[known[row]], error[:, row, known[row]]
+            phi, *tau = fitted_misalignment(z, here.T)[:, :, None]
+            error[:, row, known[row]] = here - 1j * phi * z - (tau[0] + 1j * tau[1])
         each = np.ascontiguousarray((weight * abs(error) ** 2)[:, known])
         squares[draws] = each.sum(axis=1) / (2 * known.sum())
     mean = float(squares.mean())
@@ -280,25 +282,10 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
             parameters - now.projected.parameters[:n] @ coefficients, coefficients)
 
 
-class ViewMisalignment:
-    """Least-squares misalignment of one view from its known errors, plate frame.
-
-    Parameters
-    ----------
-    z : complex array (nx, ny)
-        Positions of the marks.
-    known : bool array (nx, ny)
-        Marks whose error is known.
-    """
-
-    def __init__(self, z: np.ndarray, known: np.ndarray) -> None:
-        self.known = known
-        self.columns = np.stack([1j * z, np.ones_like(z), np.full_like(z, 1j)])
-        at = self.columns[:, known]
-        self.rows = np.concatenate([at.real, at.imag], axis=1).T
-
-    def of(self, error: np.ndarray) -> np.ndarray:
-        """Return the misalignment at every mark, complex (nx, ny)."""
-        at = error[self.known]
-        found = np.linalg.lstsq(self.rows, np.concatenate([at.real, at.imag]), rcond=None)[0]
-        return np.tensordot(found, self.columns, axes=1)
+def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return phi, Re and Im tau, (3, k), that fit errors, complex (P, k), at marks (P,) best."""
+    columns = np.stack([1j * marks, np.ones_like(marks), np.full_like(marks, 1j)], axis=1)
+    rows = np.concatenate([columns.real, columns.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    values = np.concatenate([errors.real, errors.imag])
+    return np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale[:, None]

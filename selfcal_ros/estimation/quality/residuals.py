@@ -11,6 +11,7 @@ exactly known distributions. Views noisier than the others are found by their ow
 their residuals.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +22,16 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
     grid_residuals,
 )
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.quality.prediction import noise_of
 from selfcal_ros.estimation.verdict.causes import noisier_views
 from selfcal_ros.model.readings import Measurements
 
@@ -146,27 +150,40 @@ def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
     grid = system.grid
     inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
     index = np.maximum(grid.views.site_index, 0)
-    turns = grid.views.phases.conj()
-    variance = np.zeros(grid.weight.shape)
-    for v in range(grid.n_views):
-        part = -grid.relative_weight * turns[:, None, None]
-        part[v] += turns[v]
-        for i in range(grid.n_views):
-            for j in range(grid.n_views):
-                entry = inverse[index[i], index[j]]
-                variance[v] += np.real(part[i] * entry * np.conj(part[j]))
     basis = np.array([grid.centred(grid.views.gather(-column.reshape(grid.views.shape))
                                    + grid.misaligned(unit)) for column, unit in
                       zip(grid.response.T, np.eye(3 * grid.n_views), strict=True)])
     answer = np.einsum("pq,qvij->pvij", system.grid_inverse, basis)
-    spread = np.einsum("pvij,pvij->vij", np.conj(basis), answer).real / 2
     skew = np.einsum("pvij,pvij->vij", basis, answer) / 2
-    return _redundancy(grid.weight, variance + spread), grid.weight * skew
+    return _redundancy(grid, grid.views.phases.conj(), lambda i, j: inverse[index[i], index[j]],
+                       np.einsum("pvij,pvij->vij", np.conj(basis), answer).real / 2), (
+        grid.weight * skew)
 
 
-def _redundancy(weight: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    total = weight.sum(axis=0)
-    h = weight * (1 / np.where(total > 0, total, 1.0) + variance)
+def _redundancy(part: GridSystem | AngularSystem, turns: np.ndarray,
+                entry: Callable[[int, int], np.ndarray], spread: np.ndarray) -> np.ndarray:
+    """Return 1 - h of every reading of one kind.
+
+    Parameters
+    ----------
+    part : GridSystem or AngularSystem
+        The readings.
+    turns : array (views,)
+        Factors from the map to the readings of each view.
+    entry : callable
+        Covariances of the map at the places of each mark in one and another view.
+    spread : float array (views, ...)
+        Variance of the readings that the misalignments of the views make.
+    """
+    weight, total = part.weight, part.weight.sum(axis=0)
+    variance = np.zeros(weight.shape)
+    for v in range(part.n_views):
+        own = -part.relative_weight * turns.reshape(-1, *[1] * total.ndim)
+        own[v] += turns[v]
+        for i in range(part.n_views):
+            for j in range(part.n_views):
+                variance[v] += np.real(own[i] * entry(i, j) * np.conj(own[j]))
+    h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))
     return np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0)
 
 
@@ -174,11 +191,9 @@ def drawn_redundancy(system: NormalEquations) -> np.ndarray:
     """Return 1 - h of every grid reading from the residuals of seeded unit noise."""
     grid = system.grid
     rng = np.random.default_rng(0)
-    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
     total = np.zeros(grid.weight.shape)
     for _ in range(N_DRAWS):
-        noise = rng.standard_normal((2, *root.shape)) / root * grid.read
-        residuals = grid_residuals(system, noise[0] + 1j * noise[1])
+        residuals = grid_residuals(system, noise_of(rng, total.shape, grid.weight))
         total += abs(residuals) ** 2 * grid.weight
     return np.where(grid.read, np.minimum(total / (2 * N_DRAWS), 1.0), 0.0)
 
@@ -213,13 +228,11 @@ _mixings: Memo[None, np.ndarray] = Memo()
 def _mixing(system: NormalEquations) -> np.ndarray:
     """Return the sum of squares that unit noise of each view leaves in each, (views, views)."""
     grid, rng = system.grid, np.random.default_rng(0)
-    root = np.sqrt(np.where(grid.read, grid.weight, 1.0))
     mixing = np.zeros((grid.n_views, grid.n_views))
     for u in range(grid.n_views):
         for _ in range(VIEW_DRAWS):
             noise = np.zeros(grid.weight.shape, dtype=complex)
-            draw = rng.standard_normal((2, *root[u].shape)) / root[u] * grid.read[u]
-            noise[u] = draw[0] + 1j * draw[1]
+            noise[u] = noise_of(rng, noise[u].shape, grid.weight[u])
             rest = grid_residuals(system, noise)
             mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
     return (mixing + mixing.T) / 2
@@ -234,17 +247,11 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
     inverse = angular.solve(np.eye(angular.n_lines))
-    variance = np.zeros(angular.weight.shape)
-    for v in range(angular.n_views):
-        part = -angular.relative_weight
-        part[v] += 1.0
-        for i in range(angular.n_views):
-            for j in range(angular.n_views):
-                variance[v] += part[i] * angular.covariance(inverse, i, j) * part[j]
     basis = np.array([angular.centred(unit[:, None] - angular.gather(column)) for column, unit in
                       zip(angular.response.T, np.eye(angular.n_views), strict=True)])
-    spread = np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis)
-    return _redundancy(angular.weight, variance + spread)
+    return _redundancy(angular, np.ones(angular.n_views),
+                       lambda i, j: angular.covariance(inverse, i, j),
+                       np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis))
 
 
 NOISY_RESIDUALS = 3.0

@@ -34,6 +34,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.prediction import (
     OF_A_VIEW,
     HeldReadings,
+    fitted_misalignment,
     held_readings,
     of_line_terms,
     of_terms,
@@ -306,11 +307,7 @@ def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float
     good = np.isfinite(residual)
     if good.sum() < 3:
         return (float("nan"),) * 3
-    columns = np.stack([1j * marks[good], np.ones(good.sum()), np.full(good.sum(), 1j)])
-    rows = np.concatenate([columns.real, columns.imag], axis=1).T
-    scale = np.linalg.norm(rows, axis=0)
-    values = np.concatenate([residual[good].real, residual[good].imag])
-    phi, tx, ty = np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale
+    phi, tx, ty = fitted_misalignment(marks[good], residual[good, None])[:, 0]
     return float(phi), float(tx), float(ty)
 
 
