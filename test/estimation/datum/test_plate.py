@@ -57,6 +57,27 @@ def test_each_reading_adds_what_it_does_to_the_plate(kind, sense):
     np.testing.assert_allclose(found, np.sqrt(power), rtol=1e-5)
 
 
+@pytest.mark.parametrize("sense", Sense)
+def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
+    """With declared noise, and steps too small to contradict it: then no weight changes."""
+    whole, options, power = readings(sense, lines=8), linear(), 0.0
+    whole = replace(whole, views=tuple(replace(
+        view, u=1e-8 / np.sqrt(view.count), u_theta=1e-6 / np.sqrt(view.count_theta))
+        for view in whole.views))
+    least = replace(options, uncertainty=False)
+    centre = calibrate(whole, least).artifact_map.a_theta
+    for index, view in enumerate(whole.views):
+        for name, each in (("dx", view.u), ("dy", view.u), ("dtheta", view.u_theta)):
+            for at, u in enumerate(each):
+                views = list(whole.views)
+                views[index] = replace(view, **{
+                    name: getattr(view, name) + u / 10 * (np.arange(len(each)) == at)})
+                moved = calibrate(replace(whole, views=tuple(views)), least).artifact_map.a_theta
+                power = power + (10 * (moved - centre)) ** 2
+    result = calibrate(whole, options)
+    np.testing.assert_allclose(result.artifact_map.u_a_theta, np.sqrt(power), rtol=1e-5)
+
+
 def test_without_an_uncertainty_or_with_tied_axes_there_is_none():
     found = calibrate(readings(size=5, lines=8), linear(uncertainty=False)).artifact_map
     assert np.isnan(found.u_ax).all() and np.isnan(found.u_a_theta).all()
