@@ -69,9 +69,8 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     u_g, u_theta = spread.uncertainty(noise)
     if options.uncertainty is False:
         u_g, u_theta = np.full_like(u_g, np.nan), np.full_like(u_theta, np.nan)
-    turn = _to_stage if measurements.sense is Sense.PLATE_MOVES else _as_is
-    g, g_theta = turn(found.g[..., 0], found.g_theta[:, 0], -1)
-    u_g, u_theta = turn(u_g, u_theta, 1)
+    g, g_theta = _to_stage(measurements.sense, found.g[..., 0], found.g_theta[:, 0], -1)
+    u_g, u_theta = _to_stage(measurements.sense, u_g, u_theta, 1)
     artifact = measurements.artifact
     sites = artifact.shape[0] * artifact.shape[1]
     result = CalibrationResult(
@@ -226,11 +225,10 @@ def law_covariance(result: CalibrationResult) -> tuple[np.ndarray, np.ndarray] |
     if artifact.grid_size > EXACT_SIZE or not np.isfinite(power).all():
         return None
     law = law_for(artifact, result.error_map.datum_theta, Sense(result.sense))
-    turn = _to_stage if result.sense == Sense.PLATE_MOVES else _as_is
     parts = []
     for kind in range(2):
         found = law.solve(_unit_noise(artifact, _full_views(artifact), kind=kind, exact=True))
-        g, theta = turn(found.g, found.g_theta, -1)
+        g, theta = _to_stage(result.sense, found.g, found.g_theta, -1)
         g = g.reshape(-1, g.shape[-1])
         parts.append((power[kind] * (g @ g.T), power[kind] * (theta @ theta.T)))
     (of_grid, theta_of_grid), (of_lines, theta_of_lines) = parts
@@ -301,13 +299,12 @@ def _noise(found: HuSolution, spread: _Spread,
     return xy, theta
 
 
-def _to_stage(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
+def _to_stage(sense: str, field: np.ndarray, theta: np.ndarray,
+              sign: int) -> tuple[np.ndarray, np.ndarray]:
     """Convert H(X) = -G(-X), Htheta(k) = -Gtheta(-k) to G; sign +1 for uncertainties."""
+    if sense != Sense.PLATE_MOVES:
+        return field, theta
     return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
-
-
-def _as_is(field: np.ndarray, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray]:
-    return field, theta
 
 
 def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResult:
