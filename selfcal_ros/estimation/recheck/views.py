@@ -19,6 +19,7 @@ from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.normal.angular import HarmonicSystem
 from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE
+from selfcal_ros.estimation.normal.systems import Marks, lines_of
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import Observability
@@ -325,6 +326,8 @@ def line_gain(turns: Sequence[float], weight: np.ndarray, noise: np.ndarray,
               harmonics: int = 0) -> Gain:
     """Return the estimate of the angular map from lines of a known plate, its mean 0.
 
+    Nothing is known if the lines do not determine it.
+
     Parameters
     ----------
     turns : sequence of float
@@ -334,26 +337,17 @@ def line_gain(turns: Sequence[float], weight: np.ndarray, noise: np.ndarray,
     noise : float array (r, r)
         Covariance of the readings of weight > 0, in their order, less the known plate.
     harmonics : int
-        Of the map, if it is a Fourier series; nothing is known if the lines do not determine it.
+        Of the map, if it is a Fourier series.
     """
-    view, line = np.nonzero(weight)
-    count = weight.shape[1]
-    if harmonics:
-        series = HarmonicSystem(tuple(turns), weight, harmonics)
-        design = np.hstack([series.basis[view, line], np.eye(len(turns))[view]])
-        if np.linalg.matrix_rank(design) < design.shape[1] - 1:
-            return Gain(np.zeros((count, len(view))), noise)
-        told = series.at_lines.shape[1]
-        found = least_squares(design, noise, np.eye(design.shape[1], 1))
-        return Gain(series.at_lines @ found.rows[:told], noise)
-    site = (line + np.array(turns, dtype=int)[view]) % count
-    told = np.unique(site)
-    design = np.zeros((len(view), len(told) + len(turns)))
-    design[np.arange(len(view)), np.searchsorted(told, site)] = 1
-    design[np.arange(len(view)), len(told) + view] = 1
+    count, lines = weight.shape[1], lines_of(Marks(tuple(turns), weight, (), harmonics))
+    rows = np.concatenate([lines.rows(view, np.flatnonzero(one))
+                           for view, one in enumerate(weight)])
+    basis = lines.at_lines if isinstance(lines, HarmonicSystem) else np.eye(count)[
+        :, rows.any(axis=0)]
+    design = np.hstack([rows @ basis, np.eye(len(turns))[np.nonzero(weight)[0]]])
+    if np.linalg.matrix_rank(design) < design.shape[1] - 1:
+        return Gain(np.zeros((count, len(rows))), noise)
     held = np.zeros((design.shape[1], 1))
-    held[:len(told)] = 1 / np.sqrt(len(told))
-    found = least_squares(design, noise, held)
-    rows = np.zeros((count, len(view)))
-    rows[told] = found.rows[:len(told)]
-    return Gain(rows, noise)
+    constant = basis.sum(axis=0)
+    held[:len(constant), 0] = constant / np.linalg.norm(constant)
+    return Gain(basis @ least_squares(design, noise, held).rows[:len(constant)], noise)

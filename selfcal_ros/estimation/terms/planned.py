@@ -23,13 +23,13 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import WithinMarks
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
 from selfcal_ros.estimation.terms.yaw import stage_yaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
 from selfcal_ros.model.view import View, placings_of, with_sub_views
-from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
+from selfcal_ros.model.visit_order import approach_signs, visit_sequence
 
 MISALIGNMENT_M = 30e-6
 """Standard deviation of the position of a plate along each axis."""
@@ -120,7 +120,7 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     turn, x, y = known[0] * (assumed.turn_rad, MISALIGNMENT_M, MISALIGNMENT_M)
     errors = known[1]
     found = visit_sequence(artifact, view, order=assumed.order, rng=rng)
-    n = len(found)
+    n, ends = len(found), (found.time[0], found.time[-1]) if len(found) else (0, 0)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
@@ -137,16 +137,9 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign
     return ViewVisits(mark, found.count.astype(float), np.zeros(n, dtype=complex),
-                      _view_time(found), np.exp(-1j * turn) * offset,
+                      view_time(found.time, *ends), np.exp(-1j * turn) * offset,
                       approach_signs((sites + aside).real).astype(float),
                       approach_signs((sites + aside).imag).astype(float), phase)
-
-
-def _view_time(found: VisitSequence) -> np.ndarray:
-    """Return the visits' times in the view's time: -1 at the first, +1 at the last."""
-    if len(found) < 2:
-        return np.zeros(len(found))
-    return 2 * (found.time - found.time[0]) / (found.time[-1] - found.time[0]) - 1
 
 
 def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterable[ModelTerm],

@@ -181,11 +181,11 @@ def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarr
     return np.where(whole, 1 / np.where(good, visits.u, 1.0) ** 2, count)
 
 
-def view_time(stamps_ns: np.ndarray, first: int, last: int) -> np.ndarray:
+def view_time(instants: np.ndarray, first: float, last: float) -> np.ndarray:
     """Return instants in the time of a view: -1 at its first, +1 at its last; 0 if only one."""
     if first == last:
-        return np.zeros(len(stamps_ns))
-    return 2 * (stamps_ns - first) / (last - first) - 1
+        return np.zeros(len(instants))
+    return 2 * (instants - first) / (last - first) - 1
 
 
 def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, int] | None:
