@@ -73,8 +73,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
     solved = judged(solved, measurements, options)
     result = solved.result
-    if not result.verdict.qualified:
-        check_placing(measurements)
+    if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
+        check_placing(measurements)  # without repeats residuals are the noise: no contradiction
     shown = {} if camera is None else camera.to_dict()
     if solved.model is not None and measurements.has_images:
         yaw = yaw_of(solved.model, measurements.sense)

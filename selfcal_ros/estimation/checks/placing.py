@@ -28,8 +28,12 @@ WINDOW = 3
 """Sites used on either side of the centre of the field."""
 LEAST_READINGS = 12
 """Smallest number of readings in the window for a view to be judged."""
+EXPLAINED = 1.5
+"""Mean square of the standardised readings up to which the plan's poses explain them."""
 CONTRADICTED = 4.0
-"""Mean square of the standardised readings above which the plan's poses do not explain them."""
+"""Mean square above which another pose does not explain the readings either."""
+UNREPEATED = 0.1
+"""Noise taken for readings without repeats, over the spread of stage and plate errors."""
 FREE = 6
 """Number of complex columns of a view's own motion and shape."""
 BETTER = 30.0
@@ -37,7 +41,7 @@ BETTER = 30.0
 CLEARLY = 10.0
 """Required gain over the second best pose."""
 LEFT = 0.05
-"""Part of that mean square which another pose may leave: other faults may be there as well."""
+"""Part of the plan's mean square which another pose may leave: there may be other faults too."""
 SAME_MARK = 0.1
 """Distance, in pitches, within which a mark at another pose lies on a mark of a list."""
 ON_MARKS = 0.8
@@ -97,17 +101,18 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     told = [(view.view, seen) for view in measurements.views
             if (seen := _seen(artifact, view)) is not None]
     views = [seen for _, seen in told]
-    if len(views) < 3 or not repeated:
+    if len(views) < 3:
         return None
     sigma = np.sqrt(np.average([view.sigma_xy**2 for view in repeated],
-                               weights=[view.dof_xy for view in repeated]))
+                               weights=[view.dof_xy for view in repeated])) if repeated else 0.0
     noise, spread = _sizes(views, float(sigma))
+    noise = noise if repeated else UNREPEATED * spread
     if not spread > 2 * noise:
         return None
     grid = artifact.map_grid
     sizes = max(noise, spread / 1000), spread, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0
     planned, square = _likelihood(views, *sizes)
-    if square < CONTRADICTED:
+    if square < EXPLAINED:
         return None
     tried = []
     for index, (view, seen) in enumerate(told):

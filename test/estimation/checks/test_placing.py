@@ -39,6 +39,31 @@ def test_without_ids_the_other_views_tell_how_a_plate_lies(name, sense):
     assert str(error.value).endswith("and measure this view again, or correct its pose in the plan")
 
 
+@pytest.mark.parametrize("name", WRONG)
+def test_readings_without_repeats_tell_how_a_plate_lies(name):
+    planned, lies, index, said = WRONG[name]
+    cell, names = laid(planned, lies, with_ids=False)
+    readings = unrepeated(collect(cell.events)[0])
+    told = re.escape(f"view '{names[index]}': the plate lies {said}")
+    with pytest.raises(PlacingError, match=told):
+        calibrate(readings)
+
+
+def test_a_contradiction_that_hides_in_scattered_repeats_tells_how_a_plate_lies():
+    cell, names = laid("0, 90, tx, ty", "0, 270, tx, ty", with_ids=False)
+    readings = collect(cell.events)[0]
+    drifting = replace(readings, views=tuple(
+        replace(view, sigma_xy=8 * view.sigma_xy) for view in readings.views))
+    found = misplaced(drifting)
+    assert found is not None and (found.view, found.found_deg) == (names[1], 270)
+
+
+def unrepeated(readings):
+    """Return readings of which nothing tells the noise of repeats."""
+    return replace(readings, views=tuple(
+        replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views))
+
+
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize("name", WRONG)
 def test_ids_tell_how_a_plate_lies_by_themselves(name, sense):
@@ -83,6 +108,7 @@ def test_plates_that_lie_as_planned_are_no_finding(text):
             readings = collect(cell.events)[0]
             views = tuple(replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views)
             assert misplaced(replace(readings, views=views)) is None
+            assert misplaced(unrepeated(replace(readings, views=views))) is None
 
 
 def test_other_poses_are_turns_and_shifts_each_once():
