@@ -48,7 +48,8 @@ class CalibrationAction:
                                node.destroy_client)
         node.own(ActionServer(
             node, RunCalibration, "~/run_calibration", self._execute,
-            goal_callback=self._on_goal, cancel_callback=lambda goal: CancelResponse.ACCEPT),
+            goal_callback=self._on_goal, handle_accepted_callback=self._on_accepted,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT),
             ActionServer.destroy)
 
     def tick(self) -> None:
@@ -67,12 +68,19 @@ class CalibrationAction:
 
     def _on_goal(self, _: Any) -> GoalResponse:
         if self._session.ended and not self._taken:
-            self._taken = True
             return GoalResponse.ACCEPT
         why = ("another one is executed: cancel it, or wait for its end" if self._taken else
                f"{self._session.machine.state}: abort the plan first")
         self._node.say(Level.WARN, f"goal rejected while {why}")
         return GoalResponse.REJECT
+
+    def _on_accepted(self, goal: Any) -> None:
+        self._taken = True
+        try:
+            goal.execute()
+        except Exception:  # counted where it is caught; the next goal is not rejected for it
+            self._taken = False
+            raise
 
     def _on_end(self) -> None:
         if self._ended is not None:
