@@ -52,8 +52,10 @@ def test_launch_files_have_the_arguments_that_are_given():
     assert len(lines("launch")) >= 4
     for package, name, *arguments in lines("launch"):
         assert package == "selfcal_ros"
-        text = "".join((ROOT / path).read_text() for path in (
-            f"launch/{name}", "selfcal_ros/nodes/launching.py"))
+        text = (ROOT / "launch" / name).read_text()
+        for path in ("selfcal_ros/nodes/launching.py",
+                     *re.findall(r"launch/\w+\.launch\.py", text)):
+            text += (ROOT / path).read_text()  # an included file's arguments may be given, too
         for argument in arguments:
             assert re.search(rf'rgument\(\s*"{argument.partition(":=")[0]}"', text), argument
 
