@@ -43,7 +43,7 @@ class CalibrationAction:
         self._ended: Future | None = None
         self._saved: Future | None = None
         self._save_until = 0.0
-        session.on_end = self._on_end
+        session.on_end = lambda: _complete(self._ended)
         self._saver = node.own(node.create_client(SaveMap, "solver/save_map"),
                                node.destroy_client)
         node.own(ActionServer(
@@ -58,7 +58,7 @@ class CalibrationAction:
             return
         if self._goal.is_cancel_requested and not self._session.ended:
             self._session.give_up()
-        if self._saved is not None and time.monotonic() > self._save_until:
+        if time.monotonic() > self._save_until:
             _complete(self._saved)
         view = self._session.current
         if view is not None:
@@ -81,14 +81,6 @@ class CalibrationAction:
         except Exception:  # counted where it is caught; the next goal is not rejected for it
             self._taken = False
             raise
-
-    def _on_end(self) -> None:
-        if self._ended is not None:
-            _complete(self._ended)
-
-    def _on_saved(self, _: Future) -> None:
-        if self._saved is not None:
-            _complete(self._saved)
 
     async def _execute(self, goal: Any) -> Any:
         """Run the plan of a goal to its end and have the solver save the map."""
@@ -128,7 +120,7 @@ class CalibrationAction:
         patience = self._node.settings.save_timeout
         self._saved, self._save_until = Future(), time.monotonic() + patience
         answer = self._saver.call_async(SaveMap.Request(path=path))
-        answer.add_done_callback(self._node.guarded(self._on_saved))
+        answer.add_done_callback(self._node.guarded(lambda _: _complete(self._saved)))
         try:
             await self._saved
         finally:
@@ -140,8 +132,8 @@ class CalibrationAction:
         return answer.result()
 
 
-def _complete(future: Future) -> None:
-    if not future.done():
+def _complete(future: Future | None) -> None:
+    if future is not None and not future.done():
         future.set_result(None)
 
 
