@@ -34,6 +34,8 @@ CONTRADICTED = 4.0
 """Mean square above which another pose does not explain the readings either."""
 UNREPEATED = 0.1
 """Noise taken for readings without repeats, over the spread of stage and plate errors."""
+ROUNDING = 1e-13
+"""Spread of stage and plate errors, m, up to which it is rounding error."""
 FREE = 6
 """Number of complex columns of a view's own motion and shape."""
 BETTER = 30.0
@@ -107,7 +109,7 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
                                weights=[view.dof_xy for view in repeated])) if repeated else 0.0
     noise, spread = _sizes(views, float(sigma))
     noise = noise if repeated else UNREPEATED * spread
-    if not spread > 2 * noise:
+    if not spread > max(2 * noise, ROUNDING):
         return None
     grid = artifact.map_grid
     sizes = max(noise, spread / 1000), spread, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0
