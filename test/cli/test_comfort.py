@@ -23,6 +23,7 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import write_json
 from test.support.bags import Foreign
+from test.support.details import simulated_details
 from test.support.results import known_result
 from test.support.sessions import events_of, small_bag, small_plan
 
@@ -295,7 +296,7 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     write_json("r.json", result_to_dict(known_result(5, 8)[0]))
     places = {"BAG": bag, "R": "r.json", "S": "s.json", "PLAN": bag.parent / "plan.yaml",
               "SIM": bag.parent / "simulation.yaml", "POINTS": "p.csv", "NC": "in.nc",
-              "DETAILS": root / "config/certificates/details.yaml",
+              "DETAILS": simulated_details(tmp_path),
               "DATA": root / "config/step_diagonal/case_study.csv"}
     Path("p.csv").write_text("x,y\n0,0\n")
     Path("in.nc").write_text("G0 X0 Y0\n")

@@ -10,9 +10,9 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
+from test.support.details import simulated_details
 from test.support.mark_lists import scatter
 
-DETAILS = Path(__file__).parents[2] / "config/certificates/details.yaml"
 MARKS = scatter(90).marks
 VIEWS = [{"name": "0", "repeats": 2}, {"name": "90", "rotation_deg": 90, "repeats": 2},
          {"name": "37", "rotation_deg": 37, "translation_mm": [6.5, -3.2], "angular": False},
@@ -92,7 +92,7 @@ def test_its_map_is_exported_drawn_and_certified_as_any_other(said):
                   ["export", "kmotion", "one.json", "-o", "k.txt"], ["report", "one.json", "-o",
                   "r.html"], ["cal", "export", "one.json", "-o", "a.cal"],
                   ["embed", "two", "two.json"], ["iso230", "one"],
-                  ["certificate", "one.json", str(DETAILS), "-o", "c.xml"],
+                  ["certificate", "one.json", simulated_details(Path.cwd()), "-o", "c.xml"],
                   ["batch", "one", "two", "-o", "many"]):
         said(*words)
     rows = [line.split(",") for line in Path("map.csv").read_text().split()[1:]]
