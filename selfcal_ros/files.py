@@ -60,7 +60,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
         """Compose the document, and check its size with aliases expanded."""
         node = super().get_single_node()
         if node is not None and _yaml_size(node, {}) > MAX_YAML_NODES:
-            raise yaml.composer.ComposerError(None, None, "its aliases stand for more than "
+            raise yaml.composer.ComposerError(None, None, "its aliases expand to more than "
                                               f"{MAX_YAML_NODES} values", node.start_mark)
         return node
 
@@ -70,7 +70,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
             return super().construct_object(node, deep)
         except (LookupError, AttributeError) as error:
             raise yaml.constructor.ConstructorError(
-                None, None, f"no value of the type {node.tag.rpartition(':')[2]}",
+                None, None, f"not a value of the type {node.tag.rpartition(':')[2]}",
                 node.start_mark) from error
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:

@@ -154,7 +154,7 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
         if target.is_dir():
             raise InputError(str(name), "it is a folder", "name a file")
         if str(target) in taken:
-            raise InputError(str(name), "would be written over", "name another output file")
+            raise InputError(str(name), "would be overwritten", "name another output file")
         if not target.parent.is_dir():
             raise InputError(str(name), "cannot be written (No such file or directory)",
                              "name an existing, writable folder")

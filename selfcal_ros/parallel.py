@@ -187,7 +187,7 @@ def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
                     if isinstance(future.exception(), BrokenProcessPool):
                         suspects.append(index)
                     else:
-                        yield _told(index, future)
+                        yield _outcome(index, future)
                 if suspects and not running:
                     break
         for index in sorted(suspects):
@@ -202,10 +202,10 @@ def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
         if isinstance(future.exception(), BrokenProcessPool):
             return Outcome(index, error=WorkerDied(
                 "the process that worked on it was killed (out of memory?)"))
-        return _told(index, future)
+        return _outcome(index, future)
 
 
-def _told(index: int, future: Any) -> Outcome:
+def _outcome(index: int, future: Any) -> Outcome:
     error = future.exception()
     return Outcome(index, error=error) if error is not None else Outcome(index, future.result())
 
@@ -288,7 +288,7 @@ def _with_dask(function: Callable[[Any], Any], items: Sequence[Any], workers: in
         futures = {client.submit(_in_dask, function, item, pure=False):
                    index for index, item in enumerate(items)}
         for future in as_completed(futures, loop=client.loop):
-            yield _told(futures[future], future)
+            yield _outcome(futures[future], future)
 
 
 def _in_dask(function: Callable[[Any], Any], item: Any) -> Any:

@@ -26,7 +26,7 @@ TAIL = 9 + 20 + len(MAGIC)
 """Bytes of the footer, after which only the magic follows."""
 LARGEST_SUMMARY, LARGEST_ATTACHMENT = 1 << 28, 1 << 32
 """Bytes."""
-REMEDY = "record it anew, or give an .mcap file that was closed, without file compression"
+REMEDY = "record it again, or give an .mcap file that was closed, without file compression"
 
 
 def read_result(path: str | os.PathLike, limit: int | None = None) -> CalibrationResult:
@@ -144,7 +144,7 @@ def summary_of(file: BinaryIO, path: Path) -> tuple[int, bytes]:
     whole = len(tail) == TAIL and tail[0] == FOOTER and tail.endswith(MAGIC)
     start, _, crc = struct.unpack_from("<QQI", tail, 9) if whole else (0, 0, 0)
     if not 0 < start <= size - TAIL <= start + LARGEST_SUMMARY:
-        raise InputError(str(path), "no MCAP file with a summary", REMEDY)
+        raise InputError(str(path), "not an MCAP file with a summary", REMEDY)
     file.seek(start)
     text = file.read(size - TAIL - start)
     if crc not in (0, zlib.crc32(tail[:25], zlib.crc32(text))):  # 0 = not computed

@@ -188,7 +188,7 @@ def test_what_has_no_covariance_is_refused(file, monkeypatch):
     holed = StageMap(result_of(random_map(Artifact(5, 0.01), 1, unknown=((2, 2),))))
     with pytest.raises(InputError, match="next to an unknown site"):
         holed.covariance(0.001, 0.0)
-    with pytest.raises(InputError, match="outside of the calibrated field"):
+    with pytest.raises(InputError, match="outside the calibrated field"):
         load(file, outside="refuse").covariance(1.0, 0.0)
 
 

@@ -280,9 +280,10 @@ def test_faults_in_json(tmp_path, text, message):
     ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
     ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
     ("a: \x01", ": not YAML; give a YAML text file"),
-    ("a: {b: 1,\n    c: !!int ''}", ":2:8: not YAML (no value of the type int); correct the line"),
-    ("!!bool perhaps", ":1:1: not YAML (no value of the type bool)"),
-    ("- !!timestamp x", ":1:3: not YAML (no value of the type timestamp)"),
+    ("a: {b: 1,\n    c: !!int ''}",
+     ":2:8: not YAML (not a value of the type int); correct the line"),
+    ("!!bool perhaps", ":1:1: not YAML (not a value of the type bool)"),
+    ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
     ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
     ("[" * 2_000, ": not usable YAML (maximum recursion depth")])
 @pytest.mark.usefixtures("loaders")
@@ -371,10 +372,10 @@ def test_outputs_are_refused_that_cannot_all_be_written(tmp_path, monkeypatch):
     (tmp_path / "in.csv").write_text("")
     (tmp_path / "link.json").symlink_to("in.csv")
     for outputs, message in (
-            (["in.csv"], "in.csv: would be written over"),
-            (["link.json"], "link.json: would be written over"),
-            (["bag/metadata.yaml"], "bag/metadata.yaml: would be written over"),
-            (["a", "./a"], "./a: would be written over"), (["bag"], "bag: it is a folder"),
+            (["in.csv"], "in.csv: would be overwritten"),
+            (["link.json"], "link.json: would be overwritten"),
+            (["bag/metadata.yaml"], "bag/metadata.yaml: would be overwritten"),
+            (["a", "./a"], "./a: would be overwritten"), (["bag"], "bag: it is a folder"),
             (["a", "no/a"], r"no/a: cannot be written \(No such file")):
         with pytest.raises(InputError, match="^" + message):
             check_outputs(["in.csv", "bag", None], outputs)
@@ -393,10 +394,10 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
     ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
     ("a: 9223372036854775808", "a whole number beyond 64 bits"),
     ("a: -9223372036854775809", "a whole number beyond 64 bits"),
-    ("a: &a [*a]", "its aliases stand for more than 50000 values"),
+    ("a: &a [*a]", "its aliases expand to more than 50000 values"),
     ("\n".join(["a0: &a0 [0, 0]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
                                      for i in range(1, 12)]),
-     r"f\.yaml:1:1: not YAML \(its aliases stand for more than 50000 values\)")])
+     r"f\.yaml:1:1: not YAML \(its aliases expand to more than 50000 values\)")])
 @pytest.mark.usefixtures("loaders")
 def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem):
     path = tmp_path / "f.yaml"

@@ -16,7 +16,7 @@ ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
 """The parts of estimation/: each imports only those before it."""
 
 MODULES_OF_A_FOLDER = 12
-ONE_MODULE_EACH = {"cli": "one module a verb", "nodes": "one module a node"}
+ONE_MODULE_EACH = {"cli": "one module per verb", "nodes": "one module per node"}
 """Folders that may hold more modules, and why."""
 
 

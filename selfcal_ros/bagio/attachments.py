@@ -90,7 +90,7 @@ def attach(bag: str | Path, items: Sequence[tuple[str, str, bytes]], log_time_ns
             raise InputError(f"{bag}: {name!a}", "has characters that cannot be printed",
                              "rename the file")
         if name in taken:
-            raise InputError(f"{bag}: {name}", "is in the bag already",
+            raise InputError(f"{bag}: {name}", "is already in the bag",
                              "give the file another name, or take a copy of the recording")
         taken.add(name)
     with path.open("rb") as file, atomic_file(path) as out:
@@ -137,7 +137,7 @@ def _summary(file: BinaryIO, path: Path) -> _Summary:
     start, text = summary_of(file, path)
     file.seek(max(start - DATA_END_SIZE, 0))
     if file.read(HEAD.size) != HEAD.pack(Opcode.DATA_END, 4):
-        raise InputError(str(path), "no MCAP file with a summary", REMEDY)
+        raise InputError(str(path), "not an MCAP file with a summary", REMEDY)
     others, statistics, index = [], None, []
     for opcode, body in records_in(text, path):
         record = _parsed(opcode, body)

@@ -116,7 +116,7 @@ def _metres(text: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) <= FARTHEST_M:
-        raise InputError(where, f"'{text}' is no position", "give x and y in m")
+        raise InputError(where, f"'{text}' is not a position", "give x and y in m")
     return value
 
 
@@ -156,7 +156,7 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
             now, phase, plan.plan_id, index, known, plan.artifact if known else None,
             len(plan.views), run_id=str(START_NS), model_terms=plan.model_terms), frame_id), now)
 
-    with new_bag(output) as beside, BagWriter(beside) as writer:
+    with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
         for topic, typename in INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [
                 latched if topic == COMMAND_TOPIC else volatile])
@@ -330,7 +330,7 @@ class ImageBag:
         problems: Counter[str] = Counter()
         numbers: dict[tuple, int] = {}
         topic = f"{self.space}{DETECTION_TOPIC}"
-        with new_bag(output) as beside, BagWriter(beside) as writer:
+        with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
             writer.add_topic(topic, INPUT_TOPICS[DETECTION_TOPIC], [
                 qos_profile(reliable=True, transient_local=False, depth=5000)])
             for item in self.items():

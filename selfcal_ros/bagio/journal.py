@@ -64,12 +64,12 @@ class Claim:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _said(path):
+        with _as_input_error(path):
             self._lock = _locked(path)
 
     def resume(self) -> "Journal | None":
         """Return the journal like `resume`: all of it is read, some seconds per GB."""
-        with _said(self.path):
+        with _as_input_error(self.path):
             try:
                 metadata, commands = _taken_up(self.path)
                 if not _is_over(commands):
@@ -136,7 +136,7 @@ def newest(folder: str | os.PathLike) -> tuple[Path, float] | None:
     InputError
         If the folder cannot be read.
     """
-    with _said(Path(folder)):
+    with _as_input_error(Path(folder)):
         written_ns, bag = _newest(Path(folder))
     return (bag, max(time.time_ns() - written_ns, 0) * S_PER_NS) if bag else None
 
@@ -159,7 +159,7 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
         except OSError as error:
             raise InputError(str(bag), f"cannot be created ({error.strerror})",
                              "name a writable folder") from error
-        with _said(bag):
+        with _as_input_error(bag):
             lock = _locked(bag)
             try:
                 return Journal(bag, lock, Metadata())
@@ -236,7 +236,7 @@ class Journal(Closing):
             id=number, topic=topic, message_encoding="cdr", schema_id=number,
             metadata=known.channel_metadata())
         self.flush()
-        with _said(self.path):
+        with _as_input_error(self.path):
             self._file.append(records(schema, channel))
         self._file.content.declare(schema)
         self._file.content.declare(channel)
@@ -258,7 +258,7 @@ class Journal(Closing):
             journal and are counted in `n_lost`.
         """
         waiting, self._waiting = self._waiting, []
-        with _said(self.path):
+        with _as_input_error(self.path):
             if waiting:
                 self._append(waiting)
                 self._n_appended += len(waiting)
@@ -318,7 +318,7 @@ class Journal(Closing):
         try:
             self.flush()
         finally:
-            with _said(self.path):
+            with _as_input_error(self.path):
                 try:
                     self._file.close()
                 finally:
@@ -326,7 +326,7 @@ class Journal(Closing):
             self._metadata.write(self.path)
 
 
-def _said(path: Path) -> AbstractContextManager[None]:
+def _as_input_error(path: Path) -> AbstractContextManager[None]:
     """Convert a full disk or a missing folder to an InputError."""
     return writing(path, "the journal cannot be written")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One file of a journal: consecutive MCAP records, so that any front part can be read.
+"""One file of a journal: consecutive MCAP records, so that any leading part can be read.
 
 Messages are stored without chunks: data passed to the system survive the process. A closed file
 has a summary; `finish_file` adds one to a file whose writer was killed.

@@ -175,8 +175,8 @@ def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
                 lost.append(f"the compression of the file is damaged "
                             f"({first_line(error)}): what follows is lost")
             if not plain.tell():
-                raise InputError(str(path), "nothing of the compressed file can be read",
-                                 "record the bag anew")
+                raise InputError(str(path), "no part of the compressed file can be read",
+                                 "record the bag again")
             plain.seek(0)
             yield plain
 

@@ -108,7 +108,7 @@ class McapStream:
     def _refusal(self, head: bytes) -> InputError:
         """Return the problem of a file that is not MCAP, by its first bytes."""
         if not head:
-            return InputError(str(self.path), "the file is empty", "record the bag anew")
+            return InputError(str(self.path), "the file is empty", "record the bag again")
         if head.startswith(SQLITE):
             return InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         return InputError(str(self.path), "not an MCAP file",
@@ -269,7 +269,7 @@ class McapStream:
         self._declare(file)
         if stop < size:
             self.lost.append(f"the file is damaged from byte {start} to {stop}: {count} messages "
-                             "there could be saved, what else stood there is lost")
+                             "there were recovered, the rest there is lost")
             return
         grown = self._grown(file) if isinstance(error, _Cut) else ""
         if grown:
@@ -277,7 +277,7 @@ class McapStream:
             return
         reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
         self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
-                         "of the last chunk could be saved, what followed is lost")
+                         "of the last chunk were recovered, the rest is lost")
 
 
 def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:

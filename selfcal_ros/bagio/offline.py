@@ -113,7 +113,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
                             sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
         raise NoDataError(str(path), f"none of {received['detection']} detections became a "
                           f"reading (rejected: {reasons}){tail}",
-                          [*clock, *findings, "correct the cause that is named first"][0])
+                          [*clock, *findings, "correct the first cause named"][0])
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
 
 

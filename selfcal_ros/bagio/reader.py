@@ -138,7 +138,7 @@ class BagReader:
         if self.leave_ahead or not self.ahead:
             return future_lines(self.ahead)
         return [f"{COMMAND_TOPIC}: stamped more than {MAX_AHEAD_NS // NS_PER_S} s ahead of its "
-                "logging: a live collector refuses that; set the clock that stamps, or the "
+                "log time: a live collector refuses it; set the clock that stamps, or the "
                 "recorder's"]
 
     def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:

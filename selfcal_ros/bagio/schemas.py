@@ -129,14 +129,14 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
     if not text.strip():
         store = store_with(name)
         if name not in store.fielddefs:
-            raise InputError(where, f"the bag holds no definition of {name}",
+            raise InputError(where, f"the bag has no definition of {name}",
                              "record it with message definitions")
         return store
     try:
         return _store_of_text(name, encoding, text)
     except Exception as error:
         raise InputError(where, f"the definition of {name} cannot be read ({first_line(error)})",
-                         "record the bag anew") from error
+                         "record the bag again") from error
 
 
 @lru_cache(maxsize=KEPT)
@@ -283,7 +283,7 @@ class ChannelDecoder:
         self._any_tail = self.told or not self.name.startswith(OWN)
         self._own = same_layout(self.stores[0], self.name) if self.told else False
         self._why = "" if self.told else (
-            f": the bag holds no definition of {self.name}, and they do not fit the one known here")
+            f": the bag has no definition of {self.name}, and they do not fit the one known here")
         self._columns = ColumnDecoder(self._fields, None if self._any_tail else PADDING) if (
             self._fields is not None and self.role in BLOCKS) else None
 

@@ -44,9 +44,9 @@ def new_bag(path: str | Path) -> Iterator[Path]:
         raise InputError(str(target), "exists already", "remove it or name another folder")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(target.parent) as beside:
-            yield Path(beside, target.name)
-            Path(beside, target.name).rename(target)
+        with temporary_folder(target.parent) as unfinished:
+            yield Path(unfinished, target.name)
+            Path(unfinished, target.name).rename(target)
     except OSError as error:
         raise InputError(str(target), f"cannot be created ({error.strerror})",
                          "name a writable folder") from error
@@ -68,7 +68,7 @@ def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(str(path), f"{what} ({error.strerror})",
-                         "make room or name another folder") from error
+                         "free some space or name another folder") from error
 
 
 class Closing(ABC):

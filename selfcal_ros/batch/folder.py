@@ -55,7 +55,7 @@ def find_bags(paths: Iterable[str]) -> list[Path]:
             found.setdefault(os.path.realpath(bag), bag)
     if not found:
         raise NoDataError(", ".join(paths), "no bag in it", "give MCAP files, rosbag2 folders or "
-                          "folders that hold them")
+                          "folders that contain them")
     return list(found.values())
 
 
@@ -74,7 +74,7 @@ def _below(top: Path) -> list[Path]:
 
 def _refuse(error: OSError) -> NoReturn:
     raise InputError(str(error.filename), f"cannot be read ({error.strerror})",
-                     "name a folder that you may read") from error
+                     "name a readable folder") from error
 
 
 def stat_of(bag: Path) -> list[list]:
@@ -172,7 +172,7 @@ def opened(folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise InputError(str(folder), "another batch works in this folder",
-                             "wait for its end or name another folder") from error
+                             "wait for it to end or name another folder") from error
         for part in (folder / RECORDS, folder / RESULTS):
             sweep(part)
         yield

@@ -58,7 +58,7 @@ class PlanHistory:
         p = f"p = {course.adjusted_p:.2g}"
         if course.finding is CourseKind.TREND:
             slope, low, high = course.slope_per_day
-            return (f"{text}: trend of {slope:+.3g} {unit} a day (95 %: {low:+.3g} to "
+            return (f"{text}: trend of {slope:+.3g} {unit} per day (95 %: {low:+.3g} to "
                     f"{high:+.3g}), {p}")
         return (f"{text}: changed between {self.date(course.last_before)} and "
                 f"{self.date(course.change)} by {course.after - course.before:+.3g} {unit} "
@@ -158,21 +158,21 @@ def summary_lines(records: Sequence[Record], found: Sequence[PlanHistory],
     lines = [f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
              f"{len(records) - maps} without a result; {done_before} were done before"]
     for series in found:
-        said = series.sentences()
+        sentences = series.sentences()
         lines.append(f"plan {series.plan_id}, {len(series.records)} bags from {series.date(0)} to "
                      f"{series.date(-1)}:")
         few = f"too few bags for a trend (fewer than {FEWEST})"
         nothing = few if len(series.records) < FEWEST else "no quantity has a trend or a change"
-        lines += [f"  {line}" for line in said or [nothing]]
+        lines += [f"  {line}" for line in sentences or [nothing]]
     return lines
 
 
 def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Sequence[str]) -> str:
     """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
     good = bool(records) and all(record["exit_code"] == 0 for record in records)
-    head, *said = lines
+    head, *findings = lines
     parts = [f'<p class="verdict{"" if good else " bad"}">{_text(head)}</p>',
-             f"<p>{'<br>'.join(map(_text, said))}</p>" if said else ""]
+             f"<p>{'<br>'.join(map(_text, findings))}</p>" if findings else ""]
     for series in found:
         pictures = "\n".join(_figure(series, name, course)
                              for name, course in series.courses.items())

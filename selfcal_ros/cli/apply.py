@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="interpolation between the nodes (default: that of the map; "
                              "bilinear on the plate's lattice, or if nodes are unknown)")
     parser.add_argument("--outside", choices=("clamp", "refuse"), default="clamp",
-                        help="outside the field take the error of its edge, or refuse (default "
+                        help="outside the field: use the error at its edge, or refuse (default "
                              "clamp)")
     add_json(parser)
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
-    """Say that bicubic interpolation is worth more, if it halves most of u between the nodes."""
+    """Recommend bicubic interpolation if it at least halves u between the nodes."""
     emap, used = stage.error_map, rms(stage.halfway)
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
@@ -71,8 +71,8 @@ def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:
-        print("selfcal apply: between the nodes most of u is that of bilinear interpolation, "
-              f"{used * UM_PER_M:.2g} um halfway: --method bicubic has {cubic * UM_PER_M:.2g} um",
+        print("selfcal apply: between the nodes u is mostly that of bilinear interpolation, "
+              f"{used * UM_PER_M:.2g} um halfway; with --method bicubic {cubic * UM_PER_M:.2g} um",
               file=sys.stderr)
 
 

@@ -52,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--redo", action="store_true", help="solve all bags again")
     parser.add_argument("--baseline", metavar="RESULT.json",
                         help="test every map against this one, and name those that differ")
-    add_json(parser, "the content of batch.json instead of a summary")
+    add_json(parser, "the contents of batch.json instead of a summary")
     add_options(parser)
 
 
@@ -115,9 +115,9 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings"
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
     """Return the record of a bag that failed with an internal error; it is not kept."""
-    said = first_line(error) if error is not None else "no outcome"
+    reason = first_line(error) if error is not None else "no outcome"
     return {"bag": os.path.realpath(bag), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
-            "message": f"{type(error).__name__}: {said}"}
+            "message": f"{type(error).__name__}: {reason}"}
 
 
 def _say(record: "Record") -> None:

@@ -243,9 +243,9 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 def say_bent(args: argparse.Namespace, bent_m: float) -> None:
     """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
     if bent_m >= LEAST_BEND_M:
-        print(f"selfcal {args.verb}: --onto: the active table bends between the nodes of the map "
-              f"by up to {bent_m / M_PER_UM:.3g} um, which the new table does not hold; calibrate "
-              "with nodes where that table has them, or without it", file=sys.stderr)
+        print(f"selfcal {args.verb}: --onto: the active table is curved between the nodes of the "
+              f"map by up to {bent_m / M_PER_UM:.3g} um, which the new table does not reproduce; "
+              "calibrate with the nodes of that table, or without it", file=sys.stderr)
 
 
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":

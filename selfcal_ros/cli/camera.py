@@ -23,8 +23,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     init = parser.add_subparsers(dest="camera_verb", metavar="init", required=True).add_parser(
         "init", help="from a few moves of the stage", description="Follows marks in images taken "
-        "while the stage stands at a few positions in x and y, less than half the distance of two "
-        "marks apart, and writes the parameters of mark_detector.")
+        "while the stage stands at a few positions in x and y, less than half the distance between "
+        "two marks apart, and writes the parameters of mark_detector.")
     init.add_argument("bag", metavar="BAG", help="bag with images and joint states; with "
                       "--positions the folder of image files")
     init.add_argument("--positions", metavar="FILE.csv",
@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     init.add_argument("--mark-pixels", type=float, metavar="PX", required=True,
                       help="size of a mark in the image, pixels, to a tenth")
     init.add_argument("--polarity", choices=("dark", "bright"), default="dark",
-                      help="marks on their ground (default: dark)")
+                      help="marks against the background (default: dark)")
     init.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
                       default="microscope_moves", help="what moves (default: microscope_moves)")
     add_json(init)

@@ -25,8 +25,8 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("maps", metavar="RESULT.json", nargs="+",
-                        help="results of `selfcal solve`, and maps of other origin as CSV (x, y, "
-                        "gx, gy, u_gx, u_gy in m, as `selfcal table` writes)")
+                        help="results of `selfcal solve`, and maps from other sources as CSV (x, "
+                        "y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes)")
     parser.add_argument("-o", "--output", metavar="MEAN.json", required=True,
                         help="mean map to write, read by the other verbs as a RESULT.json; "
                         "- = stdout")
@@ -59,8 +59,8 @@ def read_parts(names: Sequence[str]) -> list[Part]:
     results = {name: read_result(name)
                for name in names if name not in tables}
     if not results:
-        raise InputError(names[0], "no RESULT.json is named", "name at least one: it gives the "
-                         "sites of the mean")
+        raise InputError(names[0], "no RESULT.json is named", "name at least one: it defines "
+                         "the sites of the mean")
     artifact = next(iter(results.values())).artifact
     return [Part(name, results[name].error_map, results[name]) if name in results else
             Part(name, map_from_table(read_text(name), name, artifact), source=_source(name))
@@ -91,7 +91,7 @@ def _text(result: CalibrationResult, found: dict[str, Any]) -> str:
     for run in found["runs"]:
         lines.append(f"  {run['file']}: weight {run['weight']:.3f}, |E_n| rms "
                      f"{run['e_n_rms']:.2f}, largest {run['e_n_largest']:.2f}, beyond 1 at "
-                     f"{100 * run['beyond']:.1f} %{_p(run['p'])}{_said(run)}")
+                     f"{100 * run['beyond']:.1f} %{_p(run['p'])}{_run_text(run)}")
     return "\n".join([*lines, *(f"warning: {line}" for line in result.warnings)])
 
 
@@ -99,7 +99,7 @@ def _p(p: float | None) -> str:
     return "" if p is None else f", p = {p:.2g}"
 
 
-def _said(run: dict[str, Any]) -> str:
+def _run_text(run: dict[str, Any]) -> str:
     parts = [("disagrees in", "agrees"), ("stands out in", "stands_out")]
     words = []
     for text, key in parts:

@@ -29,14 +29,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="files to keep in the bag: RESULT.json, PLAN.yaml, tables, report; "
                         "without any, those in the bag are listed")
     parser.add_argument("--extract", metavar="FOLDER",
-                        help="write the files in the bag to this folder, which exists")
+                        help="existing folder to write the files in the bag to")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Add files to the bag, or list or extract those that it has."""
     if args.files and args.extract:
-        raise InputError("--extract", "files are named, too", "embed first, then extract")
+        raise InputError("--extract", "files are named as well", "embed first, then extract")
     if args.files:
         names = with_records(args.files)
         items = [(Path(name).name, _kind(name), read_bytes(name)) for name in names]
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         check_outputs([args.bag], names)
         for name, data in zip(names, found.values(), strict=True):
             if Path(name).exists() and read_bytes(name) != data:
-                raise InputError(name, "the file exists and has other content",
+                raise InputError(name, "the file exists with other contents",
                                  "extract to an empty folder")
         for name, data in zip(names, found.values(), strict=True):
             write_bytes(name, data)
@@ -70,11 +70,11 @@ def file_names(names: Iterable[str]) -> list[str]:
 
 def with_records(names: Sequence[str]) -> list[str]:
     """Return files and the records beside them; refuse files that are not as exported."""
-    more = [(name, beside) for name, beside in zip(names, records_of(names), strict=True)
-            if Path(beside).is_file() and beside not in names]
-    for name, beside in more:
-        require_unchanged(name, read_bytes(name), origin(read_bytes(beside), beside))
-    return [*names, *(beside for _, beside in more)]
+    more = [(name, record) for name, record in zip(names, records_of(names), strict=True)
+            if Path(record).is_file() and record not in names]
+    for name, record in more:
+        require_unchanged(name, read_bytes(name), origin(read_bytes(record), record))
+    return [*names, *(record for _, record in more)]
 
 
 def _kind(name: str) -> str:

@@ -19,14 +19,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("format", choices=FORMATS, metavar="|".join(FORMATS), help="the controller")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     add("-o", "--output", metavar="FILE", required=True,
-        help="table; beckhoff and linuxcnc: FILE_x and FILE_y, the ending after that")
+        help="table to write; beckhoff and linuxcnc: FILE_x and FILE_y, same suffix")
     add("--verify", action="store_true",
         help="print the residual of a simulated controller before and after")
     add("--onto", metavar="ACTIVE", nargs="+", action="extend",
         help="table that was loaded during the calibration (of x and y where there are two): "
              "the new one replaces it")
     add("--negate", action="store_true",
-        help="the controller subtracts the table (beckhoff, siemens: their documents do not say)")
+        help="the controller subtracts the table (beckhoff, siemens: not documented)")
     add("--integers", action="store_true", help="beckhoff before V3.1.3132 / V4.29")
     add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
     add("--force", action="store_true",
@@ -44,16 +44,16 @@ def run(args: argparse.Namespace) -> int:
     active = None
     if args.onto:
         active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
-    made = export(args.format, result, wiring, args.output, active=active, filled=filled,
+    exported = export(args.format, result, wiring, args.output, active=active, filled=filled,
                   command=command(args))
-    say_bent(args, made.bent_m)
-    backups = replace_files(args, made.files, [args.result, *(args.onto or ())], result)
+    say_bent(args, exported.bent_m)
+    backups = replace_files(args, exported.files, [args.result, *(args.onto or ())], result)
     lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:
-        lines.append(residual_text(made.residuals))
+        lines.append(residual_text(exported.residuals))
     say(args, "\n".join(lines), {
         "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
-        "filled": filled, "residuals": figures_of(made.residuals)})
+        "filled": filled, "residuals": figures_of(exported.residuals)})
     return exit_code(result)
 
 

@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--tolerance", type=float, default=1.0, metavar="UM",
         help="largest distance of the corrected path from the programmed one, um (default 1)")
     add("--decimals", type=int, default=5, metavar="N",
-        help="of coordinates in mm, one more in inches (default 5)")
+        help="decimals of coordinates in mm, one more in inches (default 5)")
     add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
     add_json(parser)
     add_frame(parser, theta=False, units=("mm", "in"))
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     rewriter = Rewriter(
         wanted(result.error_map, Wiring(frame)), tolerance_m=args.tolerance * M_PER_UM,
         step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
-    made = corrected_program(read_text(args.program), args.program, rewriter)
-    program = commented(made.text, origin_lines(result, command(args)))
-    return deliver(args, result, program, "program", filled=filled, moves=made.moves,
-                   pieces=made.pieces, note=f", {made.moves} moves as {made.pieces}")
+    corrected = corrected_program(read_text(args.program), args.program, rewriter)
+    program = commented(corrected.text, origin_lines(result, command(args)))
+    return deliver(args, result, program, "program", filled=filled, moves=corrected.moves,
+                   pieces=corrected.pieces, note=f", {corrected.moves} moves as {corrected.pieces}")

@@ -25,7 +25,7 @@ from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("source", metavar="BAG|RESULT.json",
-                        help="bag of a calibration, which has repeats; or its result, without them")
+                        help="bag of a calibration, with repeats; or its result, without them")
     parser.add_argument("--result", metavar="RESULT.json", help="calibration of this bag "
                         "(default: solve it with default options)")
     parser.add_argument("--line", type=int, default=0, metavar="N",
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             problems.append(str(error))
             axes.append(iso230.axis_figures(stage, axis, args.line))
     radius = min(at.half) * at.grid_pitch_m if args.radius is None else args.radius * M_PER_MM
-    problems = [f"{line}; M alone is given" for line in problems]
+    problems = [f"{line}; only M is given" for line in problems]
     paths = []
     for figures, chosen in ((lambda: [iso230.circle_figures(stage, radius)], args.radius),
                             (lambda: iso230.diagonal_figures(stage), None)):

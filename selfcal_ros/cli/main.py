@@ -19,31 +19,31 @@ from selfcal_ros.errors import ExitCode, InputError, SelfcalError, did_you_mean,
 VERBS = {
     "apply": "correct a table of positions: commands for true positions, or the inverse",
     "batch": "calibrate from many bags on all cores: one table, trends and changes over time",
-    "cal": "read, check, evaluate, write and verify calibration files of Aerotech controllers",
+    "cal": "read, check, evaluate, write and verify calibration files for Aerotech controllers",
     "call": "ask the sequencer of a running cell: start, confirm, redo, skip or abort",
-    "camera": "find the size of the pixels, turn and mirror of a camera",
+    "camera": "find the pixel size, rotation and mirroring of a camera",
     "cell": "check a machine cell before its first calibration",
     "certificate": "write a digital calibration certificate: DCC 3.3.0 (XML)",
-    "combine": "combine several calibrations of a stage to one map",
+    "combine": "combine several calibrations of a stage into one map",
     "detect": "find the marks in the images of a bag",
     "diff": "compare two results after removing the datum difference",
     "embed": "keep result, plan and exports in the bag, as MCAP attachments",
-    "export": "write the map of a result as the table of a controller",
+    "export": "write the map of a result as a table for a controller",
     "gcode": "correct a G-code program: for controllers without tables",
     "iso230": "figures of ISO 230: accuracy and repeatability of axes, circularity, diagonals",
     "monitor": "show a running cell on one screen, and operate its sequencer by keys",
     "plan": "check a plan of views before it is measured, or suggest views",
     "plot": "draw the maps of a result: png, svg or pdf",
-    "recheck": "whether a stage is as its calibration found it, from one view of the same plate",
+    "recheck": "check whether a calibrated stage has changed, from one view of the same plate",
     "replay": "play a bag into the live nodes and take the map from them",
     "report": "write a calibration report: one self-contained HTML or PDF file",
-    "reproduce": "run the published simulations of Hu or Qiao next to the published figures",
+    "reproduce": "repeat the published simulations of Hu or Qiao, next to the published figures",
     "simulate": "write a bag of a simulated cell, with its known truth",
     "solve": "calibrate from a bag: MCAP file or rosbag2 folder",
     "step-diagonal": "identify linear, straightness and squareness errors from a laser "
                      "step-diagonal measurement",
     "table": "write the maps of a result as a table: csv or npz",
-    "trace": "from which result a table was exported, and whether both are unchanged",
+    "trace": "show which result a table was exported from, and whether both are unchanged",
     "up": "start and supervise the nodes of a cell, and run a calibration on one screen"}
 """Verbs and what they do; `step-diagonal` is the module ``step_diagonal.py`` of this package."""
 
@@ -86,7 +86,7 @@ def _complete() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
-    said = "selfcal"
+    prefix = "selfcal"
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
         if COMPLETE in os.environ:
@@ -95,21 +95,21 @@ def main(argv: list[str] | None = None) -> int:
         parser = build_parser(_verb_in(words))
         args = parser.parse_args(argv)
         args.words = words
-        said = f"selfcal {args.verb}"
+        prefix = f"selfcal {args.verb}"
         code = int(args.run(args))
         sys.stdout.flush()
         return code
     except SelfcalError as error:
-        print(f"{said}: {error}", file=sys.stderr)
+        print(f"{prefix}: {error}", file=sys.stderr)
         return int(error.exit_code)
     except KeyboardInterrupt:
-        print(f"{said}: interrupted", file=sys.stderr)
+        print(f"{prefix}: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.DONE)
     except ModuleNotFoundError as error:
-        print(f"{said}: there is no module {error.name} in this environment; install it, see "
+        print(f"{prefix}: there is no module {error.name} in this environment; install it, see "
               "README", file=sys.stderr)
         return int(ExitCode.BAD_INPUT)
     except OSError as error:  # a name too long, a disk that fails
@@ -117,7 +117,7 @@ def main(argv: list[str] | None = None) -> int:
             raise
         fault = InputError(error.filename or "system", str(error.strerror),
                            "check path, disk and permissions")
-        print(f"{said}: {fault}", file=sys.stderr)
+        print(f"{prefix}: {fault}", file=sys.stderr)
         return int(fault.exit_code)
 
 

@@ -113,13 +113,13 @@ def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tupl
         yield "map", picture["summary"]["state"]
     if saved_as(picture):
         yield "saved", saved_as(picture)
-    for node, told in picture["health"].items():
-        if told is None and node in there:
+    for node, health in picture["health"].items():
+        if health is None and node in there:
             yield node, "gone: no sign of life"
-        elif told is not None:
+        elif health is not None:
             there.add(node)
-            if told["level"]:
-                yield node, told["message"]
+            if health["level"]:
+                yield node, health["message"]
             elif node in said:
                 yield node, "well again"
 

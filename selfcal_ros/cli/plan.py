@@ -43,15 +43,15 @@ from selfcal_ros.units import MM_PER_M, UM_PER_M
 SHOWN = 8
 """Default number of suggestions."""
 
-NODES_ONLY = ("every reading lies at a node of the map: to test what happens between nodes, give "
-              "the map nodes of its own (map:) and add a view shifted by half a pitch")
+NODES_ONLY = ("every reading lies at a node of the map: to test the error between nodes, give the "
+              "map its own nodes (map:) and add a view shifted by half a pitch")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs ``check`` and ``suggest``."""
     verbs = parser.add_subparsers(dest="plan_verb", metavar="check|suggest", required=True)
     check = verbs.add_parser(
-        "check", help="rank, unseen modes, predicted uncertainty; exit 3 if deficient")
+        "check", help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient")
     suggest = verbs.add_parser(
         "suggest", help="rank the next views, or find the best plan for a number of views")
     for sub in (check, suggest):
@@ -183,9 +183,9 @@ def _check_text(plan: Plan, found: tuple[Observability, int],
              *_nodes_text(plan), *_image_text(plan),
              _rank_text(seen)]
     if predicted is None or not seen.identifiable:
-        lines += ["the plan does not identify the stage: it cannot see"]
+        lines += ["the plan does not identify the stage: it cannot determine"]
         lines += [f"  - {text}" for text in seen.modes]
-        return lines + ["to see all of it,"] + [f"  - {text}" for text in seen.advice]
+        return lines + ["to determine all of it,"] + [f"  - {text}" for text in seen.advice]
     lines += [_known_text(plan, unknown), *_unchecked_text(seen),
               "predicted standard uncertainty, in units of the noise of one averaged reading:",
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
@@ -199,7 +199,8 @@ def _check_text(plan: Plan, found: tuple[Observability, int],
 def _rank_text(seen: Observability) -> str:
     """Return rank and unseen modes; the rank is that of the marks, without the lines."""
     lines = seen.deficiency - (seen.unknowns - seen.rank)
-    modes = counted(seen.deficiency, "unseen mode") if seen.deficiency else "no unseen modes"
+    modes = (counted(seen.deficiency, "undetermined mode") if seen.deficiency else
+             "no undetermined modes")
     return (f"rank {seen.rank} of {seen.unknowns} unknowns, {modes}"
             + (f", {lines} of them in the angular map" if lines else ""))
 
@@ -207,7 +208,7 @@ def _rank_text(seen: Observability) -> str:
 def _known_text(plan: Plan, unknown: int) -> str:
     nodes = math.prod(plan.artifact.field.shape)
     return "the plan identifies the stage" + (
-        f" at {nodes - unknown} of {nodes} nodes of the map: the other {unknown} stay unknown "
+        f" at {nodes - unknown} of {nodes} nodes of the map: the other {unknown} remain unknown "
         f"(standard uncertainty above {KNOWN:g} times the noise of a reading); add a view, or give "
         "the map fewer nodes" if unknown else "")
 
@@ -231,8 +232,8 @@ def _check_stops_text(plan: Plan) -> str:
     if not marks and plan_terms.tells_camera(plan):
         return "no check stops: images show scale, turn, distortion and sign of the camera"
     if not marks:
-        return ("no check stops: scale, turn and sign of the microscope show only where the stage "
-                "happens to stop beside a mark; add check_stops: {marks: 5, offset: 20e-6}")
+        return ("no check stops: scale, turn and sign of the microscope show only if the stage "
+                "happens to stop off its marks; add check_stops: {marks: 5, offset: 20e-6}")
     return (f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
             f"and y: {4 * marks} more exposures")
 
@@ -293,9 +294,9 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
             now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
                                     progress=progress)
     # without terms (--against none) and --sigma the figures are gains
-    told = against is not None or args.sigma is not None
+    in_um = against is not None or args.sigma is not None
     judged = plan if args.views is None else best
-    unit = _averaged_m(judged, plan_terms.assumed_of(args)) if told else None
+    unit = _averaged_m(judged, plan_terms.assumed_of(args)) if in_um else None
     if args.views is not None:
         best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
                        model_terms=plan.model_terms)
@@ -373,7 +374,7 @@ def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
 
 def _score_text(score: Score, noise_m: float | None) -> str:
     if score.deficiency:
-        return counted(score.deficiency, "unseen mode")
+        return counted(score.deficiency, "undetermined mode")
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""
     if noise_m is not None:
         unit = noise_m * UM_PER_M

@@ -51,8 +51,8 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
                         f"axis, m or with a unit (default {STOP_ERROR})")
     parser.add_argument("--stage-error", metavar="LENGTH", default=STAGE_ERROR,
                         help="errors of stage and plate, standard deviation per axis, m or with a "
-                        f"unit (default {STAGE_ERROR}): the scale of the microscope matters to "
-                        "them")
+                        f"unit (default {STAGE_ERROR}): the scale error of the microscope "
+                        "multiplies them")
     parser.add_argument("--placing", metavar="ANGLE", default=PLACING,
                         help="rotation by which plates are placed, standard deviation, rad or "
                         f"with a unit (default {PLACING})")
@@ -197,8 +197,8 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
              f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
              f"{'largest':>10} {'detected':>9}"]
     for c in checks:
-        told = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
-        lines.append(f"  {c.name:<13}{c.model or '-':<7}{told:<17}{size_text(c):>12}"
+        separable = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
+        lines.append(f"  {c.name:<13}{c.model or '-':<7}{separable:<17}{size_text(c):>12}"
                      f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
                      f" {100 * c.power:7.1f} %")
     return [*lines, *_assumptions(plan, assumed)]

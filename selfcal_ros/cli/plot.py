@@ -17,7 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     parser.add_argument("-o", "--output", metavar="FILE.png|.svg|.pdf", required=True,
-                        help="picture to write; its ending sets the format")
+                        help="picture to write; its suffix sets the format")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
     add_json(parser)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal recheck``: one view of a calibrated plate, and whether the stage is as it was."""
+"""``selfcal recheck``: one view of a calibrated plate, and whether the stage has changed."""
 
 import argparse
 import json
@@ -46,7 +46,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
     tell("\n".join([
         f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate calibrated in "
         f"{plan.artifact_from}",
-        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the map stay unknown"]
+        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the map remain unknown"]
           if found.map.n_unknown else []),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",

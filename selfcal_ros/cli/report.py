@@ -29,13 +29,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
-    parser.add_argument("--details", metavar="DETAILS.yaml", help="add what a certificate states: "
-                        "laboratory, customer, item, conditions (docs/certificate.md), "
-                        "traceability, U of distances")
+    parser.add_argument("--details", metavar="DETAILS.yaml", help="add the contents of a "
+                        "certificate: laboratory, customer, item, conditions "
+                        "(docs/certificate.md), traceability, U of distances")
     for name, what in (("stage", "name of the stage"), ("serial-number", "its serial number"),
                        ("operator", "who calibrated it")):
         parser.add_argument(f"--{name}", metavar="TEXT", default="",
-                            help=f"{what}, for the head of the report")
+                            help=f"{what}, for the heading of the report")
     add_json(parser)
     parser.add_argument("--text", action="store_true", help="also print the summary")
 

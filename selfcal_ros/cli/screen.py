@@ -115,7 +115,7 @@ def what_now(picture: dict[str, Any]) -> str:
     """Return in one sentence what the operator has to do."""
     told = picture["health"].get("pose_sequencer")
     if told is None:
-        return "pose_sequencer is not there: start it, or wait for it."
+        return "pose_sequencer is not running: start it, or wait for it."
     command = picture["command"] or {}
     state = _state(told["values"], command)
     if told["message"].startswith("waiting for ") and state in ("IDLE", "DONE", "ABORTED"):
@@ -132,7 +132,7 @@ def what_now(picture: dict[str, Any]) -> str:
         return look or "Nothing: the view is being measured."
     return {"IDLE": "Press s to start the plan.", "DONE": "Done. s starts another run.",
             "ABORTED": "Aborted. s starts a new run.",
-            "FOLLOWING": "Nothing: another sequencer commands; a ends that.",
+            "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
             }.get(state, printable(told["message"]))
 
 

@@ -61,9 +61,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="print the uncertainty budget of the map (GUM)")
     parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
                         "compared with the truth if the bag has one")
-    parser.add_argument("--map", metavar="NODES[:INTERPOLATION]", help="nodes a side of the map "
-                        "over the field of the plan's, bicubic (default) or bilinear, instead of "
-                        "those of the plan, e.g. 9:bicubic")
+    parser.add_argument("--map", metavar="NODES[:INTERPOLATION]", help="nodes per side of the "
+                        "map over the field of the plan, bicubic (default) or bilinear, instead "
+                        "of those of the plan, e.g. 9:bicubic")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
@@ -170,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
     for name in ("validate", "robust"):
         if options.plate is not None and getattr(args, name):
             raise InputError(f"--{name}", f"the plate is known from {options.plate_from}, and one "
-                             "view holds nothing to judge its readings by", "omit it")
+                             "view has nothing to check its readings against", "omit it")
     try:
         with busy("solving"):
             result = _calibrated(args, measurements, options)
@@ -184,8 +184,8 @@ def run(args: argparse.Namespace) -> int:
         raise
     if options.plate is not None and options.plate.input.get("sha256") == bag_input(
             args.bag)["sha256"]:
-        raise InputError(args.bag, f"the recording that {options.plate_from} was made of: it would "
-                         "be compared with itself", "record a new view of the plate")
+        raise InputError(args.bag, f"the recording that {options.plate_from} was computed "
+                         "from: it would be compared with itself", "record a new view of the plate")
     with busy("validating"):
         result, lines = _validated(args, measurements, options, result)
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
@@ -244,14 +244,14 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 
 
 def _since(result: Any) -> list[str]:
-    """Return the change since the calibration of a known plate as it is printed."""
+    """Return the text of the change since the calibration of a known plate."""
     found = result.extra.get("recheck")
     return [] if found is None else ["", f"change since {found['of']}:", *(
         f"  {line}" for line in recheck_lines(found))]
 
 
 def _budget(result: Any) -> list[str]:
-    """Return the budget as it is printed."""
+    """Return the text of the budget."""
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
     return ["", *budget_text(budgets(result)),

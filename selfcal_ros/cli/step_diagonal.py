@@ -69,7 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_bag_options(parser)
     parser.add_argument("-o", "--output", metavar="OUT.json",
                         help="file for the result; default: print it")
-    add_json(parser, "the result also where it is written")
+    add_json(parser, "the result, even if it is written to a file")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -156,7 +156,7 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     if args.data is not None:
-        raise InputError("arguments", "--simulate makes data and reads none",
+        raise InputError("arguments", "--simulate writes data and reads none",
                          "omit DATA.csv")
     simulation = simulation_from_dict(read_yaml(args.simulate), args.simulate)
     data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)

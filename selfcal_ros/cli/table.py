@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     """
     kind = ".csv" if args.output == STDOUT else Path(args.output).suffix.lower()
     if kind not in KINDS:
-        raise InputError(args.output, "its ending is not that of a table",
+        raise InputError(args.output, "its suffix is not that of a table",
                          "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
     check_outputs([args.result], outputs_of(args))
     result = read_result(args.result)

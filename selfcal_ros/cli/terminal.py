@@ -44,12 +44,12 @@ def add_parameters(parser: argparse._ActionsContainer, kind: type[Settings],
     for option, name in options.items():
         parameter = known[name]
         default = parameter.default
-        told = f" (default: {default})" if default else ""
+        suffix = f" (default: {default})" if default else ""
         how: dict[str, Any] = {"action": "store_true", "default": None} if default is False else {
             "type": type(default), "choices": parameter.choices or None,
             "metavar": None if parameter.choices else (parameter.unit or "value").upper()}
         parser.add_argument(f"--{option.replace('_', '-')}", **how,
-                            help=f"{parameter.description}{told}".replace("%", "%%"))
+                            help=f"{parameter.description}{suffix}".replace("%", "%%"))
 
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:

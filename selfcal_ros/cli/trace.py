@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal trace``: from which result a table was exported, and whether both are as they were.
+"""``selfcal trace``: the result behind an exported table, and whether both are unchanged.
 
 Every exported FILE has a record beside it, FILE.origin.json; `selfcal embed` keeps both in a bag.
 """
@@ -31,8 +31,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("files", metavar="FILE|BAG", nargs="+", help="exported tables, programs "
                         "and certificates; a bag stands for all those in it")
-    parser.add_argument("--result", metavar="RESULT.json", help="the result that they should be "
-                        "of (default: the one in the record, relative to the file)")
+    parser.add_argument("--result", metavar="RESULT.json", help="the result that they should come "
+                        "from (default: the one in the record, relative to the file)")
     add_json(parser)
 
 
@@ -62,7 +62,7 @@ def record(args: argparse.Namespace, result: "CalibrationResult",
 
 def deliver(args: argparse.Namespace, result: CalibrationResult, content: str | bytes, key: str, *,
             note: str = "", **data: Any) -> int:
-    """Write what is made of a result to its file with a record, or to stdout; return the exit code.
+    """Write an export of a result to its file with a record, or to stdout; return the exit code.
 
     Parameters
     ----------
@@ -140,8 +140,9 @@ def run(args: argparse.Namespace) -> int:
     lines, found = [], []
     for name in args.files:
         for file, made, source in traced(name, args.result):
-            lines.append(f"{file}: unchanged, of {source} (SHA-256 {made['result']['sha256'][:16]}"
-                         f"…), exported on {made['created']} by: {made['command']}")
+            lines.append(f"{file}: unchanged, from {source} "
+                         f"(SHA-256 {made['result']['sha256'][:16]}…), "
+                         f"exported on {made['created']} by: {made['command']}")
             found.append({"file": file, "result": source, **{
                 key: made[key] for key in ("created", "command", "sha256")},
                 "result_sha256": made["result"]["sha256"]})
@@ -162,7 +163,7 @@ def traced(name: str, result: str | None) -> Sequence[tuple[str, dict[str, Any],
         if not Path(name).exists():
             raise InputError(name, "no such file", "check the path")
         if not Path(f"{name}{ENDING}").is_file():
-            raise InputError(name, f"has no record {Path(name).name}{ENDING} beside it", REMEDY)
+            raise InputError(name, f"has no record {Path(name).name}{ENDING} next to it", REMEDY)
         made = origin(read_bytes(f"{name}{ENDING}"), f"{name}{ENDING}")
         require_unchanged(name, read_bytes(name), made)
         source = result or os.path.normpath(Path(name).parent / made["result"]["file"])
@@ -174,7 +175,7 @@ def traced(name: str, result: str | None) -> Sequence[tuple[str, dict[str, Any],
         if key.endswith(ENDING):
             file, made = key.removesuffix(ENDING), origin(kept[key], f"{name}/{key}")
             if file not in kept:
-                raise InputError(f"{name}/{key}", f"{file} is not in the bag", "embed it, too")
+                raise InputError(f"{name}/{key}", f"{file} is not in the bag", "embed it as well")
             require_unchanged(f"{name}/{file}", kept[file], made)
             out.append((f"{name}/{file}", made, _require_result(f"{name}/{file}", made, others)))
     if not out:

@@ -22,9 +22,9 @@ MOST = 0.5
 """Fraction of the detections above which one reason of rejection is diagnosed."""
 AT_LEAST = 5
 """Smallest number of detections for a diagnosis."""
-SCALES = {1.0: "", 1e3: "1000 times what the marks ask for: they are in mm",
-          1e-3: "a thousandth of what the marks ask for: they are in km, or their unit is unknown",
-          1e6: "a million times what the marks ask for: they are in µm"}
+SCALES = {1.0: "", 1e3: "1000 times those of the marks: they are in mm",
+          1e-3: "a thousandth of those of the marks: they are in km, or their unit is unknown",
+          1e6: "a million times those of the marks: they are in µm"}
 """Indicated position over true position -> meaning."""
 UNUSABLE = {Reason.ENCODER_MALFORMED: "give each name of a joint state its position",
             Reason.ENCODER_NOT_FINITE: "publish positions that are finite"}
@@ -140,8 +140,8 @@ def _joints(e: Evidence) -> str | None:
                     f"as {reason}; {remedy}")
     seen = ", ".join(repr(name) for name in e.seen_joints) or "none"
     missing = ", ".join(repr(name) for name in e.missing_joints)
-    return (f"no encoder sample of the joint {missing} came; names that came: {seen}; set joint_x, "
-            "joint_y, joint_theta")
+    return (f"no encoder sample of the joint {missing} arrived; joints received: {seen}; set "
+            "joint_x, joint_y, joint_theta")
 
 
 def _clock(e: Evidence) -> str | None:
@@ -152,15 +152,15 @@ def _clock(e: Evidence) -> str | None:
         return None
     offset = (last - end) / NS_PER_S
     return (f"the detections are stamped about {_seconds(offset)} "
-            f"{'after' if offset > 0 else 'before'} the encoder samples; let both be stamped by "
-            "one clock")
+            f"{'after' if offset > 0 else 'before'} the encoder samples; stamp both by one "
+            "clock")
 
 
 def _rate(e: Evidence) -> str | None:
     if not e.encoder_step_s > e.max_gap_s:
         return None
     return (f"the encoder sends a sample every {e.encoder_step_s:.3g} s, and max_encoder_gap is "
-            f"{e.max_gap_s:g} s; send more, or raise max_encoder_gap")
+            f"{e.max_gap_s:g} s; send them more often, or raise max_encoder_gap")
 
 
 def _command_clock(e: Evidence) -> str | None:
@@ -171,8 +171,8 @@ def _command_clock(e: Evidence) -> str | None:
         return None
     offset = (first - begin if last < begin else last - end) / NS_PER_S
     return (f"all detections are stamped {'before the first' if offset < 0 else 'after the last'} "
-            f"view command, about {_seconds(offset)} off; let the cell and the sequencer have one "
-            "clock")
+            f"view command, about {_seconds(offset)} off; synchronise the clocks of the cell and "
+            "the sequencer")
 
 
 def _seconds(offset_s: float) -> str:
@@ -198,7 +198,7 @@ def _stage(e: Evidence) -> str | None:
         return (f"the stage did not move: it is indicated at {_place(e, middle)} at all of them; "
                 "name the joints that move, in joint_x and joint_y")
     check = "joint_x and joint_y, " if e.joints else ""
-    return (f"the stage stands {away:.3g} m from the sites of the marks that are seen (median); "
+    return (f"the stage stands {away:.3g} m from the sites of the detected marks (median); "
             f"check {check}the ids of the marks and how the plate lies")
 
 
@@ -233,7 +233,7 @@ def wrong_joints(e: Evidence) -> str | None:
             return (signs[0] * x + 1j * signs[1] * y) / scale
 
         if _away(e, tried) <= e.limit_m:
-            return _said(scale, swapped=swapped, signs=signs, sense=e.sense)
+            return _fault_text(scale, swapped=swapped, signs=signs, sense=e.sense)
     return None
 
 
@@ -245,7 +245,7 @@ def _away(e: Evidence, changed: Callable[[np.ndarray], np.ndarray]) -> float:
     return max(view.away(changed(view.stage)) for view in e.marks) * e.pitch_m
 
 
-def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
+def _fault_text(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
     """Return the fault and the remedy for a combination that fits."""
     what, remedy = [], []
     if SCALES[scale]:
@@ -257,9 +257,9 @@ def _said(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) 
     if signs == (-1, -1):
         other = next(s for s in Sense if s is not sense)
         what.append("the stage is indicated at minus the marks' sites")
-        remedy.append(f"the sense is the other one: measurement_sense {other} (--sense {other})")
+        remedy.append(f"the sense is reversed: measurement_sense {other} (--sense {other})")
     elif signs != (1, 1):
         axis = "x" if signs == (-1, 1) else "y"
         what.append(f"{axis} is indicated with the wrong sign")
-        remedy.append(f"turn the sign of {axis}")
+        remedy.append(f"reverse the sign of {axis}")
     return f"{' and '.join(what)}; {', and '.join(remedy)}"

@@ -75,8 +75,8 @@ class JointTrack:
 
 def filled(approach: np.ndarray) -> np.ndarray:
     """Return directions of approach with `AS_BEFORE` replaced; unknown before the first."""
-    told = np.where(approach == AS_BEFORE, 0, np.arange(len(approach)))
-    out = approach[np.maximum.accumulate(told)] if len(approach) else approach
+    source = np.where(approach == AS_BEFORE, 0, np.arange(len(approach)))
+    out = approach[np.maximum.accumulate(source)] if len(approach) else approach
     return np.where(out == AS_BEFORE, 0, out).astype(np.int8)
 
 
@@ -179,11 +179,11 @@ class JointSamples:
                           np.abs(self._difference(p[after] - p[left])))
             noise = self._noise_near(stamps_ns)
             speed_noise = self._speed_noise_near(stamps_ns)
-            told = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
+            excess = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
                             np.fmax(v[before], v[after]), 0.0)
-            told = np.where(told > BEYOND_NOISE * speed_noise, told, 0.0)
-            told *= (t[right] - t[left]) / NS_PER_S
-            fast &= np.fmax(way, told) > BEYOND_NOISE * np.sqrt(2) * noise
+            excess = np.where(excess > BEYOND_NOISE * speed_noise, excess, 0.0)
+            excess *= (t[right] - t[left]) / NS_PER_S
+            fast &= np.fmax(way, excess) > BEYOND_NOISE * np.sqrt(2) * noise
         return fast
 
     def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
@@ -224,12 +224,12 @@ class JointSamples:
         broken[0] = True
         resumed = np.full(len(stamps_ns), -1)
         resumed[owner[broken[sample]]] = sample[broken[sample]]
-        told = (last >= 0) & (last >= resumed)
-        out[told] = np.sign(positions[told] - p[last[told]])
+        found = (last >= 0) & (last >= resumed)
+        out[found] = np.sign(positions[found] - p[last[found]])
         lost = (resumed >= 0) | ~np.isfinite(positions)
         lost |= np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS
         lost |= limit > max(MOST_NOISE_M, threshold)
-        out[lost & ~told] = 0
+        out[lost & ~found] = 0
         return out
 
     def _noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
@@ -299,13 +299,13 @@ class JointSamples:
         calm = (near_left & ~fast_left) | (near_right & ~fast_right)
         both = ~calm & (near_left | near_right)
         moving = np.where(exact, both, fast)
-        told = np.isfinite(v[before]) & np.isfinite(v[after])
+        reported = np.isfinite(v[before]) & np.isfinite(v[after])
         rate = np.fmax(v[before], v[after])
-        moving = np.where(told & exact, rate > self.limits.max_speed, moving)
-        moving |= told & (rate > self.limits.max_speed)
+        moving = np.where(reported & exact, rate > self.limits.max_speed, moving)
+        moving |= reported & (rate > self.limits.max_speed)
         reversing = fast & ~exact & (
             (fast_left & (move_left * middle < 0)) | (fast_right & (move_right * middle < 0)))
-        reversing |= exact & fast_left & fast_right & (move_left * move_right < 0) & ~told
+        reversing |= exact & fast_left & fast_right & (move_left * move_right < 0) & ~reported
         return moving, reversing
 
     def _step_to(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -337,8 +337,8 @@ class JointSamples:
             inside = (side >= 0) & (side < len(at))
             chosen = np.clip(side, 0, len(at) - 1)
             near = np.abs(where[chosen] - stamps_ns) <= window
-            beside = (at[chosen] >= before - 1) & (at[chosen] <= after + 1)
-            out |= inside & (near | beside)
+            adjacent = (at[chosen] >= before - 1) & (at[chosen] <= after + 1)
+            out |= inside & (near | adjacent)
         return out
 
 

@@ -124,11 +124,11 @@ class Exposures:
             stamps_ns = np.unique(stamps_ns)
         due = self._insert(stamps_ns, due)
         known = np.flatnonzero(due & (self._joints[0]["approach"] != NEW))
-        before = self._told(known)
+        before = self._at_instants(known)
         for group in self._groups(np.flatnonzero(due)):
             self._look_up(group)
         changed = np.zeros(len(due), dtype=bool)
-        changed[known] = _differ(before, self._told(known))
+        changed[known] = _differ(before, self._at_instants(known))
         return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
@@ -160,7 +160,7 @@ class Exposures:
             return np.append(due, np.ones(len(at), dtype=bool))
         return np.insert(due, at, True)
 
-    def _told(self, index: np.ndarray) -> list[np.ndarray]:
+    def _at_instants(self, index: np.ndarray) -> list[np.ndarray]:
         """Return positions, reasons and motions of all joints at some of the instants."""
         return [joint[name][index] for joint in self._joints
                 for name in ("position", "reason", "moving")]

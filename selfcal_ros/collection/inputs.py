@@ -160,10 +160,10 @@ def check_command(command: Command) -> None:
                          "let run_id be the stamp of the run's first command, ns")
     if command.view is None or command.artifact is None:
         if command.phase in (Phase.PLACE, Phase.MEASURE):
-            raise InputError(where, "it describes no view", "fill its pose and its plate")
+            raise InputError(where, "it describes no view", "fill in its pose and its plate")
         return
     if not (command.view.grid or command.view.angular):
-        raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
+        raise InputError(where, "neither grid nor angular marks are requested", "set one to true")
     if not 1 <= command.view.repeats <= MAX_REPEATS:
         raise InputError(where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}")
     command.view.on_stage(command.artifact)
@@ -189,7 +189,7 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     _check_values(where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy",
                                                             "sigma_theta"))
     if not abs(readings.axis_theta) <= np.pi:
-        raise InputError(where, "axis_theta is no angle", "give rad")
+        raise InputError(where, "axis_theta is not an angle", "give rad")
     if readings.visits is not None:
         _check_values(f"{where}, visits", readings.visits, ("dx", "dy", "offset_x", "offset_y"),
                       ("u", "sigma_m"))
@@ -213,7 +213,7 @@ def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[s
     for name in (*told, *perhaps):
         size = np.abs(getattr(table, name))
         if np.any(size > LARGEST) or (name in told and np.isnan(size).any()):
-            raise InputError(where, f"{name} is no number up to {LARGEST:g}", "give m and rad")
+            raise InputError(where, f"{name} is not a number up to {LARGEST:g}", "give m and rad")
         if name in ("u", "u_theta") and np.any((size > 0) & (size < SMALLEST_U)):
             raise InputError(where, f"{name} is below {SMALLEST_U:g}", "give m and rad")
 
@@ -234,7 +234,7 @@ def check_simulated(command: Command) -> None:
         return  # DONE or ABORT: nothing to simulate
     exposures = max(math.prod(artifact.shape), artifact.angular_count) * view.repeats
     if exposures > MAX_EXPOSURES:
-        raise InputError(f"view command {command.view_index}", f"{exposures} exposures are beyond "
+        raise InputError(f"view command {command.view_index}", f"{exposures} exposures exceed "
                          f"the {MAX_EXPOSURES} of a simulated cell", "ask for fewer marks, repeats")
 
 
@@ -273,10 +273,10 @@ class Reason(StrEnum):
 
 ADVICE = {
     Reason.ROTATION: "the view's rotation is not known well enough to tell these marks or lines "
-                     "from their neighbours; let the detections carry ids, or measure grid marks "
+                     "from their neighbours; give the detections ids, or measure grid marks "
                      "in the same view, or state a max_rotation of less than half a line",
-    Reason.BAD_SIGMA: "their sigma is no standard uncertainty in m or rad (1e-12 to 1000, 0 = not "
-                      "known), or 10,000 times smaller than that of the others; correct the "
+    Reason.BAD_SIGMA: "their sigma is not a standard uncertainty in m or rad (1e-12 to 1000, 0 = "
+                      "not known), or 10,000 times smaller than that of the others; correct the "
                       "publisher of the detections",
     Reason.FUTURE: "they were stamped more than a minute ahead of the collector's clock; set the "
                    "clock that stamps them",
@@ -284,15 +284,15 @@ ADVICE = {
 """Remedies for reasons reported even for a single detection."""
 
 REMEDY = {
-    Reason.NO_ENCODER: "the encoder has a gap around the exposures; let it send without gaps, or "
-                       "raise max_encoder_gap",
+    Reason.NO_ENCODER: "the encoder has a gap around the exposures; make it publish without gaps, "
+                       "or raise max_encoder_gap",
     Reason.MOVING: "the stage moved at the exposure; expose at rest, stamp the exposure itself, or "
                    "raise max_speed and max_angular_speed",
     Reason.OUTSIDE_VIEWS: "they were exposed when no view was being measured; expose between "
                           "MEASURE and the next command, stamped by one clock",
-    Reason.CONTRADICTION: "encoder samples contradict each other; let one source publish the "
-                          "joints, with a clock that does not step",
-    Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is wanted; correct "
+    Reason.CONTRADICTION: "encoder samples contradict each other; publish the joints from one "
+                          "source, with a clock that does not step",
+    Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is expected; correct "
                        "the publisher of the detections",
     Reason.BAD_SIGMA: ADVICE[Reason.BAD_SIGMA],
     Reason.FUTURE: ADVICE[Reason.FUTURE],
@@ -302,22 +302,22 @@ REMEDY = {
                          "numbering of the marks (m, n from -h to h, k from 0)",
     Reason.NOT_IN_VIEW: "the view does not ask for these marks; check its pose and its kinds of "
                         "marks in the plan",
-    Reason.AMBIGUOUS: "two marks are about equally near; let the detections carry ids",
+    Reason.AMBIGUOUS: "two marks are about equally near; give the detections ids",
     Reason.ROTATION: ADVICE[Reason.ROTATION],
-    Reason.TOO_FAR: "the marks are not where the view has them; check how the plate lies, the unit "
-                    "of the offsets (m, stage axes) and the ids, or raise max_deviation",
-    Reason.NOT_AT_MARK: "the stage does not stand at the marks that are seen; check joint_x, "
+    Reason.TOO_FAR: "the marks are not where the view places them; check how the plate lies, the "
+                    "unit of the offsets (m, stage axes) and the ids, or raise max_deviation",
+    Reason.NOT_AT_MARK: "the stage does not stand at the detected marks; check joint_x, "
                         "joint_y and measurement_sense, or set max_stage_distance",
     Reason.OUTSIDE_IMAGE: "they lie beyond the marks that an image shows; raise nx and ny under "
                           "image in the plan, or if the plate lies half a pitch or more off its "
-                          "place: state that in the plan (translation_mm of the views), or let the "
-                          "detections carry ids",
-    Reason.SEVERAL: "an exposure shows several marks, and the plan knows of one; state in the plan "
-                    "how many an image shows (image: {nx: 3, ny: 3}), or publish the mark nearest "
-                    "to the optical axis alone",
+                          "place: state that in the plan (translation_mm of the views), or give "
+                          "the detections ids",
+    Reason.SEVERAL: "an exposure shows several marks, but the plan expects one; state in the plan "
+                    "how many an image shows (image: {nx: 3, ny: 3}), or publish only the mark "
+                    "nearest to the optical axis",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
-    Reason.OUTLIER: "repeats of a mark contradict each other; check that each id is of one mark, "
-                    "or raise outlier_limit",
+    Reason.OUTLIER: "repeats of a mark contradict each other; check that each id belongs to one "
+                    "mark, or raise outlier_limit",
 }
 """Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 

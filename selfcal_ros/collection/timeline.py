@@ -170,8 +170,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
             continue
         view = command.placed()
         if command.artifact != artifact:
-            raise InputError(f"view command of '{view.name}'", "describes another plate than the "
-                             f"rest of plan '{plan_id}'", "use one plate in one plan")
+            raise InputError(f"view command of '{view.name}'", "describes a different plate from "
+                             f"the rest of plan '{plan_id}'", "use one plate in one plan")
         views[command.view_index] = view
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
     return Timeline(plan_id, artifact, dict(sorted(views.items())),

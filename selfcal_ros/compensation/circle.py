@@ -59,7 +59,7 @@ class Circle:
         self._points: list[float] = self._closed.tolist()
         if cubic and not np.isfinite(values).all():
             raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
-                             "unknown", "bicubic needs all of them: take bilinear")
+                             "unknown", "bicubic needs all of them: use bilinear")
         steps = np.abs(np.diff(self._closed))
         if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
             raise steep("angular lines")

@@ -71,10 +71,10 @@ class Compensator:
                  outside: Outside = "clamp", fitted: Interpolation | None = None) -> None:
         if method not in get_args(Interpolation):
             raise InputError("compensator method", f"'{method}' is unknown",
-                             "take bilinear or bicubic")
+                             "use bilinear or bicubic")
         if outside not in get_args(Outside):
             raise InputError("compensator outside", f"'{outside}' is unknown",
-                             "take clamp or refuse")
+                             "use clamp or refuse")
         self.error_map, self.method, self.outside = error_map, method, outside
         self._is_fitted = fitted == method
         self._pitch = error_map.artifact.grid_pitch_m
@@ -82,7 +82,7 @@ class Compensator:
         if method == "bicubic" and not np.isfinite(fields).all():
             missing = int((~error_map.valid).sum())
             raise InputError("error map", f"{missing} sites are unknown",
-                             "bicubic needs all of them: take bilinear or measure them")
+                             "bicubic needs all of them: use bilinear or measure them")
         self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
         if self._cells.largest_step > MAX_SLOPE * self._pitch:
             raise steep("sites")
@@ -312,7 +312,7 @@ class Compensator:
             x, y = np.broadcast_arrays(x_m, y_m)
             first = np.flatnonzero(off)[0]
             raise InputError("position", f"({x.flat[first]:.9g}, {y.flat[first]:.9g}) m lies "
-                             "outside of the calibrated field", "stay inside or take clamp")
+                             "outside the calibrated field", "stay inside or use clamp")
 
     def _refuse_no_theta(self) -> None:
         if not self.has_theta:
@@ -322,4 +322,4 @@ class Compensator:
 
 def _steep_spline() -> InputError:
     return InputError("error map", "the cubic spline between the sites is steeper than one half",
-                      "such a map cannot be inverted: take bilinear, or check its units (m, rad)")
+                      "such a map cannot be inverted: use bilinear, or check its units (m, rad)")

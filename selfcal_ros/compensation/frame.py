@@ -52,7 +52,7 @@ class MachineFrame:
     def __post_init__(self) -> None:
         """Refuse an unknown unit, axes that are not distinct, and values that are not numbers."""
         if self.unit not in LENGTHS_M:
-            raise InputError("unit", f"'{self.unit}' is not a primary unit", "take m, mm, um or in")
+            raise InputError("unit", f"'{self.unit}' is not a primary unit", "use m, mm, um or in")
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
         if len(set(axes)) < len(axes):
             raise InputError("axes", f"the indices {axes} are not distinct",

@@ -31,7 +31,7 @@ from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 CAMERA_STEPS = 3
-"""Fits from which the camera's distortion is taken, each with the readings of the one before."""
+"""Number of fits for the camera's distortion, each with the readings corrected by the last."""
 
 
 def calibrate(measurements: Measurements, options: Options | None = None) -> CalibrationResult:
@@ -93,24 +93,24 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 def _check_images(measurements: Measurements, options: Options) -> None:
     """Refuse images of several marks where their common noise would be missing in U."""
     if options.method == "law" and measurements.has_images:
-        raise InputError("method law", "Hu's law has no place for images of several marks",
+        raise InputError("method law", "Hu's law cannot use images of several marks",
                          "solve with --method joint")
 
 
 def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurements:
-    """Return readings of a known plate freed from the camera that its calibration found."""
+    """Return readings of a known plate corrected by the camera of its calibration."""
     if not measurements.has_images:
         return measurements
     if KEY not in plate.result.extra:
-        raise InputError(plate.where, "its noise is not told apart into that of images and that of "
-                         "marks, and the readings have images of several marks",
+        raise InputError(plate.where, "its noise is not separated into that of images and that of "
+                         "marks, but the readings have images of several marks",
                          "recheck with one mark an image, or calibrate with such images")
     camera = known_camera(plate.result)
     return measurements if camera is None else straightened(measurements, camera)
 
 
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
-    """Return the camera that images of several marks show, and the readings freed from it."""
+    """Return the camera shown by images of several marks, and the readings corrected for it."""
     straight, camera = measurements, None
     if options.method == "law" or not measurements.has_images:
         return None, measurements
@@ -125,7 +125,7 @@ def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None
 
 
 def _knowing(camera: Camera, options: Options) -> Options:
-    """Return the options with what images tell of the microscope in place of what is assumed."""
+    """Return the options with the microscope shown by images in place of the assumed one."""
     known = microscope_term(*camera.u_linear)
     return replace(options, assumed=tuple(
         known if term.name is TermName.MICROSCOPE else term for term in options.assumed))

@@ -122,7 +122,7 @@ class ReferenceLength:
             object.__setattr__(self, "marks", tuple(tuple(mark) for mark in self.marks))
         if (self.kind == ReferenceKind.MARKS) != (len(set(self.marks or ())) == 2):
             raise InputError("reference length", f"kind '{self.kind}' with the marks {self.marks}",
-                             "two different marks belong to the kind 'marks', and to no other")
+                             "the kind 'marks' needs two different marks, other kinds have none")
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
         if not abs(self.relative_error) < 0.1:
             raise InputError("reference length", f"{self.relative_error} is not a relative error",

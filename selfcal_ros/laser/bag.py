@@ -85,8 +85,8 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
                 unstamped.add(topic)
             stamp = stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
             if stamp > np.iinfo(np.int64).max:
-                raise InputError(f"{path}: topic {topic}", f"{stamp} ns is no time of logging",
-                                 "record the bag anew")
+                raise InputError(f"{path}: topic {topic}", f"{stamp} ns is not a log time",
+                                 "record the bag again")
             found[topic].append((stamp, wanted[topic](name, decoded, f"{path}: topic {topic}")))
     for topic, samples in found.items():
         if not samples:
@@ -94,8 +94,8 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
                               "the bag has " + (", ".join(sorted(others)) or "no other topic"))
     notes = [f"{path}: {line}" for line in reader.lost]
     if len(unstamped) == 1:
-        notes.append(f"{path}: {unstamped.pop()} has no stamps of its own and counts at its time "
-                     "of logging, the other topic at its stamps: both clocks must agree")
+        notes.append(f"{path}: {unstamped.pop()} has no stamps and is used at its log time, the "
+                     "other topic at its stamps: both clocks must agree")
     laser_ns, laser = _sorted(found[topics.laser])
     position_ns, positions = _sorted(found[topics.position])
     return Recording(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
@@ -117,7 +117,8 @@ def _decoder(stream: McapStream, channel: Any, where: str) -> Callable:
         try:
             return schema.name, store.deserialize_cdr(data, schema.name)
         except Exception as error:  # a damaged payload may fail anywhere in the decoder
-            raise InputError(where, "a message cannot be decoded", "record the bag anew") from error
+            raise InputError(where, "a message cannot be decoded",
+                             "record the bag again") from error
 
     return decode
 
@@ -128,7 +129,7 @@ def _laser_value(topics: SeriesTopics) -> Callable:
             return _joints(message, (topics.laser_field or "laser",), where)[0]
         field = topics.laser_field or FIELDS.get(name)
         if field is None:
-            raise InputError(where, f"the type {name} has no distance known by itself",
+            raise InputError(where, f"the type {name} has no known distance field",
                              "name its field with --laser-field")
         return _number(message, field, where)
 
@@ -167,7 +168,7 @@ def _number(message: Any, field: str, where: str) -> float:
     try:
         return float(message)
     except (TypeError, ValueError) as error:
-        raise InputError(where, f"the field '{field}' is no number", "name a numeric field"
+        raise InputError(where, f"the field '{field}' is not a number", "name a numeric field"
                          ) from error
 
 

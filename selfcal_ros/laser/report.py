@@ -126,9 +126,9 @@ def _advice(found: StepDiagonalResult) -> list[str]:
     lengths = found.closure.lengths_m
     if found.method == Method.NEW and lengths is not None and \
             abs(lengths) > CLOSURE_SHARE * diagonal:
-        out.append(f"the diagonals differ from what the linear errors make of them by "
-                   f"{lengths * UM_PER_M:.3g} um: laser off the machine's diagonal, or linear "
-                   "errors of another state of the machine")
+        out.append(f"the diagonals differ from those calculated from the linear errors by "
+                   f"{lengths * UM_PER_M:.3g} um: the laser is off the machine's diagonal, or "
+                   "the linear errors are of another state of the machine")
     if found.covariance is not None and not found.covariance.any():
         out.append("all repeats are identical: an uncertainty of zero cannot be right")
     return out

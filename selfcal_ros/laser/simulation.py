@@ -337,7 +337,7 @@ def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
     counts = {len(values) for values in lists.values()}
     if len(counts) > 1:
         raise InputError(where, f"lists of errors of different lengths {sorted(counts)}",
-                         "give one value a block")
+                         "give one value per block")
     errors = np.zeros((dim, counts.pop(), dim))
     for name, values in lists.items():
         j, c = kinds[name]

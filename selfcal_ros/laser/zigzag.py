@@ -128,7 +128,7 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     chains, notes = _chains(moves), []
     outliers = sum(rest.outliers for rest in rests)
     if outliers:
-        notes.append(f"{outliers} laser sample(s) that jump out of their rest are left out")
+        notes.append(f"{outliers} outlying laser sample(s) within a rest are left out")
     if None in moves:
         notes.append(f"{moves.count(None)} move(s) that are not one step of one axis")
     dim = len(rule.steps_m)
@@ -136,7 +136,7 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     for chain in chains:
         name = _name_of_run(chain, dim)
         if name is None:
-            notes.append(f"{len(chain)} move(s) that are no run along a diagonal or an axis")
+            notes.append(f"{len(chain)} move(s) that are not a run along a diagonal or an axis")
         else:
             named.setdefault(name, []).append(chain)
     _same_length(named, dim)

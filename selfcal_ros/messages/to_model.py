@@ -79,7 +79,7 @@ def command(message: Any) -> Command:
         For an unknown phase, an invalid plate, or a stamp before 1970.
     """
     if stamp_ns(message) < 0:
-        raise InputError(COMMAND_TOPIC, "the stamp lies before 1970", "set the clock")
+        raise InputError(COMMAND_TOPIC, "the stamp is before 1970", "set the clock")
     try:
         phase = Phase(int(message.phase))
     except ValueError as error:

@@ -264,7 +264,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         If it has no sentences: call `selfcal_ros.reporting.words.findings.worded` first.
     """
     emap, amap, artifact = result.error_map, result.artifact_map, result.plate
-    made = result.provenance
+    provenance = result.provenance
     return {
         "schema": SCHEMA,
         "plan_id": result.plan_id,
@@ -278,8 +278,8 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(result.model),
         "reference": result.reference,
-        "provenance": plain({"created": made.created, "duration_s": made.duration_s,
-                             "version": made.version, **made.extra}),
+        "provenance": plain({"created": provenance.created, "duration_s": provenance.duration_s,
+                             "version": provenance.version, **provenance.extra}),
         "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),
         "coverage_factor": plain({kind: getattr(result.noise, f"k_{kind}")
                                   for kind in ("xy", "theta")}),

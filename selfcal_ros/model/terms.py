@@ -208,7 +208,7 @@ def _size(text: str, where: str) -> float:
     if not 0 <= size < math.inf:
         raise InputError(where, f"the size '{text}' is not a positive number",
                          "give a standard deviation in SI units, as in plate_shape:30e-9, or 0 "
-                         "for a term that is known to be none")
+                         "for a term that is known to be zero")
     if size and not SMALLEST <= size <= LARGEST:
         raise InputError(where, f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
                          "give a standard deviation in SI units, as in plate_shape:30e-9")

@@ -281,7 +281,7 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
     """Return the verdict of a result; without one, whether it is identified decides."""
     if data is None:
         grade = Grade.GOOD if identifiable else Grade.NOT_QUALIFIED
-        return Verdict(grade, sentence="Not judged: written before there were verdicts")
+        return Verdict(grade, sentence="Not judged: written by a version without verdicts")
     qualified = read(bool, data["qualified"])
     grade = Grade(data.get("grade", "good" if qualified else "not_qualified"))
     if qualified is (grade is Grade.NOT_QUALIFIED):

@@ -157,14 +157,14 @@ class View:
             return
         if self.check_marks < 1 or not self.check_offset_m > 0:
             raise InputError(where, f"{self.check_marks} marks, {self.check_offset_m:g} m off",
-                             "give marks and offset both, e.g. {marks: 5, offset: 20e-6}")
+                             "give both marks and offset, e.g. {marks: 5, offset: 20e-6}")
         most = MOST_CHECK_OFFSET * artifact.grid_pitch_m
         if self.check_offset_m > most:
             raise InputError(where, f"{self.check_offset_m:g} m is more than a quarter of the "
                              "pitch", f"stop at most {most:g} m off the mark; 20e-6 is usual")
         there = self.on_stage(artifact).n_in_field(artifact) if self.grid else 0
         if self.check_marks > there:
-            raise InputError(where, f"{self.check_marks} marks are wanted, {there} lie in the "
+            raise InputError(where, f"{self.check_marks} marks are requested, {there} lie in the "
                              "field", "ask for fewer marks")
 
     @property

@@ -71,7 +71,7 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             raise InputError(
                 "bag_player", f"{' and '.join(missing)} "
                 f"after {self.settings.wait_for_subscribers:g} s, nothing was played", "start it, "
-                "name another node as listener, or set listener to '' to wait for nobody")
+                "name another node as listener, or set listener to '' to play without waiting")
         return not missing
 
 

@@ -49,7 +49,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
         """Stop recording: after an incomplete write, later messages could not be read."""
         self._failed, self._unrecorded = str(error), self._unrecorded + 1
         self.say(Level.ERROR, f"recording has ended: {error}; what was recorded is readable, "
-                 "start anew in another folder")
+                 "start again in another folder")
 
     def _flush(self) -> None:
         if not self._failed:

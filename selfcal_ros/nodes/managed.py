@@ -110,7 +110,7 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         if self.state == "active":
             return self.diagnose_session()
         if self.state == "finalized":
-            return Diagnosis(Level.ERROR, "finalized: shut down by a request, for good; end this "
+            return Diagnosis(Level.ERROR, "finalized: shut down on request; end this "
                              "process and start the node again")
         if self.problem is not None:
             return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")

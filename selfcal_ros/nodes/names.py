@@ -106,8 +106,8 @@ def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
             verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
             if verdict == QoSCompatibility.ERROR:
                 why = reason.removeprefix("ERROR: ").rstrip(";. ")
-                found.append(f"{topic.name}: nothing is heard of {_name(offer)} ({why}); offer "
-                             "what docs/ros2.md lists")
+                found.append(f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
+                             "offer the QoS in docs/ros2.md")
     return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
 
 
@@ -118,7 +118,7 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
         if len(offers) > 1:
             found.append(f"{topic} has {len(offers)} publishers: "
-                         f"{', '.join(sorted(map(_name, offers)))}; one is right")
+                         f"{', '.join(sorted(map(_name, offers)))}; only one is allowed")
     return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
 
 

@@ -153,7 +153,7 @@ class Player:
         for _ in range(min(count, self.total - self._at)):
             if self._next is None:
                 raise InputError(self._bag, f"{self.total} messages when it was opened, "
-                                 f"{self._at} now", "play a bag that nobody changes")
+                                 f"{self._at} now", "play a bag that is not being changed")
             topic, stamp, data = self._next
             if stamp > due_ns:
                 return False

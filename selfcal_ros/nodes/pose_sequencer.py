@@ -128,7 +128,7 @@ class CalibrationAction:
         if not answer.done():
             self._saver.remove_pending_request(answer)
             raise NoDataError("run_calibration", f"the solver has not saved the map in {patience:g}"
-                              " s", "look at the solver, then call save_map")
+                              " s", "check the solver, then call save_map")
         return answer.result()
 
 

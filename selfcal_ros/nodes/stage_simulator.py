@@ -127,10 +127,10 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
                  events: Iterator[Event]) -> Iterator[Event | Exposure]:
         """Return the events of a view with images instead of grid detections."""
         assert self.truth is not None and self._camera is not None
-        made = exposures(self.truth, plan, self._camera, chain(
+        exposed = exposures(self.truth, plan, self._camera, chain(
             [replace(command, view=command.placed())], events), sense=self._cell.sense)
-        next(made)  # the command itself
-        return made
+        next(exposed)  # the command itself
+        return exposed
 
     def _plan_with(self, command: inputs.Command) -> Plan:
         """Return the plan with the commanded view inserted; commands describe themselves."""

@@ -238,12 +238,13 @@ def qiao_text(found: QiaoReproduction) -> str:
                 for rank, n in zip(ranks, SIZES, strict=True))
     lines += [f"{equal} of {found.ranks.size} ranks as printed (marked =)", "",
               "Figure 3: without noise, n = 11, stage and plate errors of 1 um"]
-    for number, (program, said) in enumerate(zip(found.programs, (
+    for number, (program, published) in enumerate(zip(found.programs, (
             "the answer covers the truth", "the answer differs from the truth"), strict=True), 1):
         how = "" if not program.deficiency else \
-            f" by the generalised inverse; `solve` refuses ({program.deficiency} modes unseen)"
+            (" by the generalised inverse; `solve` refuses "
+             f"({program.deficiency} modes undetermined)")
         lines.append(f"  program {number}, {' + '.join(program.views)}: rms error "
-                     f"{program.rms_um:.3g} um{how}; published: {said}")
+                     f"{program.rms_um:.3g} um{how}; published: {published}")
     return "\n".join([*lines, "", *_noise_text(found)])
 
 
@@ -257,4 +258,4 @@ def _noise_text(found: QiaoReproduction) -> list[str]:
             f"  bound of any unbiased estimator: {found.bound_um:.4f} um",
             "  The published figure lies below that bound, so that it is not reproducible as "
             "printed.",
-            f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably what was done."]
+            f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used."]

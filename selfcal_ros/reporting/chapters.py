@@ -51,7 +51,7 @@ MAX_MARKS = 51 * 51
 """Largest plate whose components are shown."""
 MAX_ROWS = 200
 """Longest table of a report; the rest is in the result file."""
-TITLES = {"outliers": "Marks removed or weighted down", "validation": "Held-out validation",
+TITLES = {"outliers": "Marks removed or given less weight", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
 DRAWN = {"residuals", "rejected_at", "camera"}
@@ -220,9 +220,9 @@ def provenance_section(result: CalibrationResult) -> Section:
 
 AT_NODES = ("At the nodes: how well the map itself is known. Use it to compare two calibrations, "
             "and for positions that are nodes.")
-ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, which the curvature of "
-            "the map tells. Use it for the positions of a corrected machine anywhere; a finer "
-            "plate reduces it.")
+ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, estimated from the "
+            "curvature of the map. Use it for the positions of a corrected machine anywhere; a "
+            "finer plate reduces it.")
 
 
 @dataclass(frozen=True)
@@ -259,10 +259,10 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
     found = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
         _causes(result), _maps(result, truth), _uncertainty(result), *more, _plate(result),
-        Chapter("Camera", _figures((camera_errors(result), "Each vector leads from where a mark is "
-                                    "in the image to where the camera puts it."),
-                                    (stage_yaw(result), "How far the image, and with it what the "
-                                     "stage carries, is rotated where the stage stands.")),
+        Chapter("Camera", _figures((camera_errors(result), "Each vector points from the true "
+                                    "position of a mark in the image to the measured one."),
+                                    (stage_yaw(result), "Rotation of the image, and of whatever "
+                                     "the stage carries, at each position of the stage.")),
                 (Section("Camera", camera_facts(result)),)),
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
@@ -303,14 +303,14 @@ def _causes(result: CalibrationResult) -> Chapter:
 
 def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
     pairs: list[tuple[Drawing | None, str]] = [
-        (error_map(result, truth), "Each vector leads from where the stage is to where its "
-                                   "encoders say it is. A pointer shows the numbers of a site."),
-        (component_maps(result), "Gx and Gy at one scale, and below how well each is known. Sites "
-                                 "that are not known are grey. Edges and corners are seen by fewer "
+        (error_map(result, truth), "Each vector points from the true position of the stage "
+                                   "to the indicated one. Hover over a site to see its numbers."),
+        (component_maps(result), "Gx and Gy at one scale, and below them their uncertainties. "
+                                 "Unknown sites are grey. Edges and corners are covered by fewer "
                                  "views.")]
     if result.artifact.angular_count:
-        pairs.append((angular_map(result, truth), "Error of the angle at every line; on the "
-                                                  "dashed circle there is none."))
+        pairs.append((angular_map(result, truth), "Error of the angle at every line; it is "
+                                                  "zero on the dashed circle."))
     tables = [sections.error_section(result)]
     if truth is not None:
         tables.append(sections.truth_section(result.error_map, truth))
@@ -323,11 +323,11 @@ def _plate(result: CalibrationResult) -> Chapter:
     if not plate.error_map.valid.any():
         return Chapter("Plate")
     pairs: list[tuple[Drawing | None, str]] = [
-        (error_map(plate, of="plate"), "Each vector leads from where a mark should be on the plate "
-                                       "to where it is.")]
+        (error_map(plate, of="plate"), "Each vector points from the nominal to the true position "
+                                       "of a mark on the plate.")]
     if plate.artifact.m.size <= MAX_MARKS:
-        pairs.append((component_maps(plate, of="plate"), "Ax and Ay at one scale, and below how "
-                                                         "well each is known."))
+        pairs.append((component_maps(plate, of="plate"), "Ax and Ay at one scale, and below them "
+                                                         "their uncertainties."))
     if np.isfinite(plate.error_map.g_theta).any():
         pairs.append((angular_map(plate, of="plate"), "Error of the angle of every line."))
     return Chapter("Plate", _figures(*pairs))
@@ -377,14 +377,15 @@ def _residuals(result: CalibrationResult) -> Chapter:
          "noise; neighbours that point the same way are an effect outside the model."),
         (distributions(found, "xy"), "Bars against the normal curve of the same rms, and the same "
          "residuals against normal quantiles: dots off the line at its ends are outliers."),
-        (distributions(found, "theta"), "The same of the angular lines."),
-        (courses(found, result.noise.sigma_xy), "Means over a sixtieth of the view's time each. A "
-         "curve that leaves the band is a drift."))
+        (distributions(found, "theta"), "The same for the angular lines."),
+        (courses(found, result.noise.sigma_xy), "Means over sixtieths of the view's duration. A "
+         "curve that leaves the band shows a drift."))
     return Chapter("Residuals", _figures(*pairs))
 
 
 def _rejected(result: CalibrationResult) -> Chapter:
     return Chapter("Rejected readings", _figures(
         (rejected_map(result), "Many at one place: dirt or damage on the plate or the stage. Many "
-         "in one row: a moment of the run. Detections without an encoder sample have no place.")),
+         "in one row: a disturbance at that time. Detections without an encoder sample "
+         "have no position.")),
         (sections.rejected_section(result),))

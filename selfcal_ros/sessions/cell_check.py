@@ -126,9 +126,9 @@ class CellCheck:
         self._send(Phase.DONE)
         yield from self._wait(self._pause_s)
         self._tell("revisits", revisited, "a mark named as missing was "
-                   + ("seen again" if revisited else f"not seen again in {REVISIT_S:g} s"),
+                   + ("seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
                    "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
-                   "marks until the next command; without it set min_repeats")
+                   "marks until the next command; if it cannot, set min_repeats")
         yield from self._old(aborted, measured)
 
     def _aborted(self) -> Steps[Command | None]:
@@ -149,7 +149,7 @@ class CellCheck:
         yield from self._wait(self._pause_s)
         late = len(self._seen) - before
         self._tell("abort", not late, f"{late} detections later than {self._pause_s:.3g} s after "
-                   "ABORT", "give up what is being measured when ABORT comes")
+                   "ABORT", "stop measuring when ABORT arrives")
         return command
 
     def _measured(self) -> Steps[Command]:
@@ -192,9 +192,9 @@ class CellCheck:
             count += len(self._seen) - before
             self._send(Phase.ABORT)
             yield from self._wait(self._pause_s)
-        self._tell("old commands", not count, f"{count} detections after a MEASURE that was over "
-                   "had been sent again", "remember the stamps of the commands that were acted on "
-                   "and act on none of them again")
+        self._tell("old commands", not count, f"{count} detections after a finished MEASURE was "
+                   "sent again", "remember the stamps of executed commands and do not "
+                   "execute them again")
 
     def _place_and_measure(self) -> Steps[Command]:
         self._send(Phase.PLACE)
@@ -263,8 +263,8 @@ class CellCheck:
                    f"({settings.encoder_rate_min:g} Hz), or set these")
         age = float(np.median(ages)) * S_PER_NS
         self._tell("encoder clock", abs(age) <= settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.4g} ms old when they come",
-                   "stamp samples when they are taken, by a clock that is set as this machine's "
+                   f"stamps {age * MS_PER_S:.4g} ms old when they arrive",
+                   "stamp samples when they are taken, by a clock synchronised with this machine's "
                    "(NTP, PTP)")
 
     def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
@@ -275,7 +275,7 @@ class CellCheck:
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
         self._tell("detection clock", not outside and age <= OLDEST_S
                    and earliest >= -self._settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.4g} ms old when they come, {outside} outside of the "
+                   f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the "
                    "view", "stamp detections at the instant of exposure, by the clock of the "
                    "joint states")
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
@@ -284,7 +284,7 @@ class CellCheck:
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
         self._tell("ids", not mistaken, f"{named} of {len(self._seen)} detections name their mark"
-                   + ("" if named else ": marks are told by where they lie")
+                   + ("" if named else ": marks are identified by their positions")
                    + "".join(f", {count} {reason}" for reason, count in mistaken.items()),
                    "; ".join(REMEDY[reason] for reason in mistaken))
         self._judge_loss(progress, rejected, total)
@@ -298,20 +298,20 @@ class CellCheck:
                    f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
                    + "".join(f", {count} {reason}" for reason, count in others.items()),
                    "; ".join(REMEDY.get(Reason(reason), reason) for reason in others)
-                   or "see every mark of the view `repeats` times; publish reliable, depth 1000")
+                   or "measure every mark `repeats` times; publish reliable, depth 1000")
         self._tell("check stops", progress.check_done >= progress.check_expected,
                    f"{progress.check_done} of {progress.check_expected} marks from all four sides",
-                   "see check_marks marks again at +x, -x, +y and -y, check_offset off each "
+                   "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
                    "(docs/cell.md)")
 
     def _judge_wiring(self, measurements: Measurements) -> None:
         [view] = measurements.views
         faults = [worded(fault) for fault in wiring_faults(measurements)]
-        told = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
+        slopes = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
                 "theta": _slope(view.motion_theta, 0)}
-        figure = ", ".join(f"{axis} {slope:+.3f}" for axis, slope in told.items()
+        figure = ", ".join(f"{axis} {slope:+.3f}" for axis, slope in slopes.items()
                            if slope is not None)
-        shown = told["x"] is not None and told["y"] is not None
+        shown = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
         self._tell("signs", shown and not faults,
                    what or f"offset against stage {figure or 'not known'} (-1 expected)",

@@ -112,8 +112,8 @@ class RosTime:
         Writes to the log: one line for each change.
     """
 
-    NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is "
-               "stamped 0; play the bag with --clock, or start the node without use_sim_time")
+    NOTHING = ("use_sim_time is set but nothing is received on /clock: this node stamps "
+               "everything 0; play the bag with --clock, or start the node without use_sim_time")
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
@@ -136,8 +136,8 @@ class RosTime:
             return Level.WARN, self.NOTHING
         if state == "moves":
             return Level.OK, "stamps follow /clock (use_sim_time); work and health do not"
-        return Level.OK, (f"/clock stands at {self._last_ns * S_PER_NS:.3f} s; work and health go "
-                          "on, stamps do not")
+        return Level.OK, (f"/clock has stopped at {self._last_ns * S_PER_NS:.3f} s; work and "
+                          "health continue, stamps do not")
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class RunWatch:
             found["set back"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.0f} s "
                 "ahead of this machine's clock, which was set back: no later run is shown; restart "
-                "measurement_collector, which leaves such a run aside, and start the plan again")
+                "measurement_collector, which ignores such a run, and start the plan again")
         elif newest is not None and 0 < now_ns < newest.stamp_ns - NS_PER_S:
             found["ahead"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.1f} s "
@@ -210,8 +210,8 @@ class RunWatch:
         if strays:
             found["strays"] = (
                 f"{len(strays)} view command{'s' * (len(strays) > 1)} of plan "
-                f"'{strays[-1].plan_id}' came within a run that goes on, of no run that has begun, "
-                "and changed nothing: find who published them")
+                f"'{strays[-1].plan_id}' arrived during a run, belonging to no run that has begun, "
+                "and changed nothing: find their publisher")
         return found
 
 

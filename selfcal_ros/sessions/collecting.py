@@ -130,7 +130,7 @@ class CollectingSession:
             where = (f"in view '{view}'; {self._gap}; missing marks have to be measured again, by "
                      "the cell or with redo_view")
         messages = sum(collector.received.values())
-        self._ports.say(Level.OK, f"took up {journal} with {messages} messages, {where}")
+        self._ports.say(Level.OK, f"resumed {journal} with {messages} messages, {where}")
 
     def take_command(self, message: Any, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
@@ -160,8 +160,8 @@ class CollectingSession:
         elif command.phase == Phase.MEASURE and is_older:
             self.missed[view] = name = command.placed().name
             self._ports.say(
-                Level.WARN, f"view '{name}' began before this node: what was "
-                "detected until now is missing here; redo_view measures it again")
+                Level.WARN, f"view '{name}' began before this node: earlier "
+                "detections are missing here; redo_view measures it again")
 
     def tick(self) -> None:
         """Publish the progress of the views, if there are new messages and it is due."""
@@ -273,9 +273,9 @@ class CollectingSession:
             self._rejected.update(view.readings.rejected)
         index = self.collector.timeline.intervals[-1].view_index
         for number in sorted(progress):  # of the last view with one
-            told = progress[number].readings
+            readings = progress[number].readings
             xy, theta = (new if math.isfinite(new) else old for new, old in zip(
-                (told.sigma_xy, told.sigma_theta), self._noise, strict=True))
+                (readings.sigma_xy, readings.sigma_theta), self._noise, strict=True))
             self._noise = xy, theta
         self._needed = progress[index].needed if index is not None else 0
         self._since_ns = self.collector.timeline.intervals[-1].start_ns
@@ -346,12 +346,12 @@ class CollectingSession:
         measuring = last is not None and last.phase == Phase.MEASURE
         problems = []
         if measuring and not heard:
-            problems.append("the encoder is not heard")
+            problems.append("no encoder samples are received")
         elif measuring and gap > self.settings.max_encoder_gap:
             problems.append(f"a gap of {gap:.3g} s between encoder samples: exposures in it are "
                             "rejected")
         elif measuring and rate < least:
-            problems.append(f"{rate:.0f} encoder samples a second, {least:g} are wanted")
+            problems.append(f"{rate:.0f} encoder samples per second, {least:g} are wanted")
         elif measuring and 0 < limit < jitter:
             problems.append(f"the intervals between encoder samples vary by {jitter:.3g} s, the "
                             f"limit is {limit:g} s")

@@ -101,7 +101,7 @@ class CompensatingSession:
         if not summary.qualified:
             return f"{_source(message)} is not qualified: {summary.state}"
         if summary.views_done < summary.views_planned:
-            return (f"{_source(message)} is of {summary.views_done} of {summary.views_planned} "
+            return (f"{_source(message)} contains {summary.views_done} of {summary.views_planned} "
                     "views")
         return ""
 
@@ -237,7 +237,7 @@ class CompensatingSession:
         points = [np.asarray(axis, dtype=float) for axis in (x, y, theta)]
         if len(points[0]) != len(points[1]) or len(points[2]) not in (0, len(points[0])):
             raise InputError("request", f"{len(x)} x, {len(y)} y and {len(theta)} theta",
-                             "give as many of each; theta may be empty")
+                             "give equally many of each; theta may be empty")
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")
         found = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
@@ -266,12 +266,12 @@ class CompensatingSession:
         oldest, limit = max(ages_s, default=0.0), self._settings.max_age
         lines = []
         if skipped:
-            lines.append(f"{skipped} samples skipped since the last status: newer ones had come "
-                         "before they could be corrected, or they were lost on the way")
+            lines.append(f"{skipped} samples skipped since the last status: newer ones arrived "
+                         "before they could be corrected, or they were lost in transport")
         refused, self._commands_refused = self._commands_refused, 0
         if refused:
             lines.append(f"{refused} commands refused since the last status and not passed on: no "
-                         "map, no complete position, or a place that the map does not know")
+                         "map, no complete position, or a position where the map is unknown")
         if oldest > limit:
             lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
                          f"published, max_age is {limit * MS_PER_S:g} ms")
@@ -317,7 +317,7 @@ def result_file(path: str, folder: str) -> Path:
         If `path` is empty, outside the folder, or exists and is not a regular file.
     """
     if not path or "\0" in path:
-        raise InputError("path", "is no file name" if path else "is empty", "name a file")
+        raise InputError("path", "is not a file name" if path else "is empty", "name a file")
     root = Path(os.path.realpath(folder or os.curdir))
     target = Path(os.path.realpath(root / path))
     if not target.is_relative_to(root):

@@ -154,17 +154,17 @@ class Losses(Tally):
 
     def add(self, topic: str, number: int, told_by: str = "events") -> None:
         """Count `number` messages of `topic` as lost, unless reported by the other source."""
-        told = self._told.setdefault(topic, Counter())
-        told[told_by] += number
-        total = max(told.values())
+        counts = self._told.setdefault(topic, Counter())
+        counts[told_by] += number
+        total = max(counts.values())
         new = total - self.counts[topic]
         if new > 0:
-            self._tell(topic, total, f"{topic}: {new} messages were lost on the way; the machine "
+            self._tell(topic, total, f"{topic}: {new} messages were lost in transport; the machine "
                        "or the network is too slow for them", f"{topic}: {total} messages lost")
 
     def add_unheard(self, topic: str, number: int) -> None:
         """Count messages published while this node had no subscription."""
-        line = f"{topic}: {number} messages were published while this node did not listen"
+        line = f"{topic}: {number} messages were published while this node was not listening"
         place = f"{topic}, not listening"
         self._tell(place, self.counts[place] + number, line, line)
 

@@ -253,13 +253,13 @@ class JournalKeeper:
         self._tell_problem(looked)
         for file in looked.files[:1]:
             self._ports.say(Level.WARN, f"{file.parent}: its run was left "
-                            f"{(self._left_ago_s or 0.0) / S_PER_H:.0f} h ago and is not taken up; "
-                            "'selfcal solve' reads it, a greater journal_max_age goes on with it")
+                            f"{(self._left_ago_s or 0.0) / S_PER_H:.0f} h ago and is not resumed; "
+                            "'selfcal solve' reads it, a larger journal_max_age resumes it")
         return []
 
     def _tell_problem(self, looked: JournalSearch) -> None:
         if looked.problem is not None:
-            self._ports.say(Level.WARN, f"{looked.problem}; the run is not taken up")
+            self._ports.say(Level.WARN, f"{looked.problem}; the run is not resumed")
 
     def _open(self, journal: journals.Journal | None) -> None:
         """Continue a journal, or start one."""
@@ -313,7 +313,7 @@ class JournalKeeper:
     def _fail(self, error: InputError) -> None:
         self._tried_s = self._failed_s = self._ports.now_s()
         if not self._problem:
-            self._ports.say(Level.WARN, f"{error}; collecting goes on without")
+            self._ports.say(Level.WARN, f"{error}; collecting continues without it")
         self._problem = str(error)
 
     def close(self) -> None:

@@ -164,7 +164,7 @@ class Reception:
             self.session.collector.refuse(kind, reason, int(mine.sum()))
             self._refuse(topic, InputError(
                 topic, f"stamped {ahead[mine].max() * S_PER_NS:.0f} s ahead of this node's clock: "
-                "not used", "set the clock that stamps it; what is stamped right counts"))
+                "not used", "set the clock that stamps it; correctly stamped messages are used"))
         return [item for item, left_out in zip(waiting, refused, strict=True) if not left_out]
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
@@ -220,10 +220,10 @@ class Reception:
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the journal."""
-        told = self.journal.diagnosis()
+        found = self.journal.diagnosis()
         if self.restoring:
-            return Diagnosis(Level.WARN, f"reading the journal {self._source}", told.values)
-        return told
+            return Diagnosis(Level.WARN, f"reading the journal {self._source}", found.values)
+        return found
 
     def close(self) -> None:
         """Take waiting messages, and close the journal."""

@@ -10,7 +10,7 @@ from selfcal_ros.collection.inputs import advice
 from selfcal_ros.sessions.health import Level
 
 PATIENCE_S = 6.0
-"""Time for which a cause must be found again and again before it is reported. The topics of a cell
+"""Time for which a cause must persist before it is reported. The topics of a cell
 are received independently: until the encoder samples around a detection and the commands before it
 have come, it is rejected or counted in another view."""
 

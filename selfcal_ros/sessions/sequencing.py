@@ -103,7 +103,7 @@ class SequencingSession:
         missing = self.missing()
         self.waiting = bool(missing)
         if missing:
-            answer = f"waiting for {', '.join(missing)}; starts by itself when they are there"
+            answer = f"waiting for {', '.join(missing)}; starts automatically when they are present"
         else:
             answer = self._resume() or self._start()
         self._ports.say(Level.WARN if missing else Level.OK, answer)
@@ -119,22 +119,22 @@ class SequencingSession:
         plan = self.machine.need_plan()
         if not (self._settings.resume and self._fresh and collector):
             return ""
-        told, phase = collector.values, collector.values.get("phase", "")
+        health, phase = collector.values, collector.values.get("phase", "")
         index, stamp_ns = collector.number("view"), collector.number("command_stamp")
-        if (told.get("plan_id") != plan.plan_id or not told.get("run_id")
+        if (health.get("plan_id") != plan.plan_id or not health.get("run_id")
                 or phase not in ("PLACE", "MEASURE") or index is None or index >= len(plan.views)
-                or told.get("view_name") != plan.views[index].name
+                or health.get("view_name") != plan.views[index].name
                 or stamp_ns is None or is_future(stamp_ns, self._ports.now_ns())):
             return ""
-        if told.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
+        if health.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
             return ""  # the plan has been edited: the readings are of another one
-        self.run_id = told["run_id"]
+        self.run_id = health["run_id"]
         command = self.machine.resume(index, Phase[phase])
         self._send([command], stamp_ns=stamp_ns)  # unchanged: it is latched again
         known = self._measured.get((plan.plan_id, self.run_id), {})
         names = ", ".join(known[number] for number in sorted(known))
-        return (f"took up run {self.run_id} in view '{plan.views[index].name}', {phase}"
-                + (f"; measured already: {names}" if names else ""))
+        return (f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}"
+                + (f"; already measured: {names}" if names else ""))
 
     def act(self, request: Callable[[], list[Command]]) -> str:
         """Pass a request to the state machine and report the result."""
@@ -181,11 +181,11 @@ class SequencingSession:
                                 "run later than this one: not followed; find who sends them")
             self._strayed = True
             return
-        said = "another publisher sends view commands: following them; abort ends that"
+        warning = "another publisher sends view commands: following them; abort ends that"
         if self.machine.state in ENDED:
-            self._ports.say(Level.OK, said)
+            self._ports.say(Level.OK, warning)
         elif self.machine.state is not State.FOLLOWING:  # its own plan ends here
-            self._ports.say(Level.WARN, said)
+            self._ports.say(Level.WARN, warning)
         self.machine.foreign_command()
         self.waiting = self._fresh = False
         self._end()
@@ -235,7 +235,7 @@ class SequencingSession:
     def _tell_silent(self) -> None:
         """Report once that a companion is silent while a plan is running."""
         nodes = " and ".join(self.presence.silent()) if self.current is not None else ""
-        line = nodes and (f"no sign of life of {nodes} for {PATIENCE_S:g} s: it hangs or has "
+        line = nodes and (f"no sign of life from {nodes} for {PATIENCE_S:g} s: it hangs or has "
                           "ended; wait for it, or start it again: what was measured is kept")
         if line and line != self._silent:
             self._ports.say(Level.WARN, line)
@@ -251,15 +251,15 @@ class SequencingSession:
     def _stall_line(self) -> str:
         status, name = self._status, self._view_name
         if status is None or not status.detections_used + status.detections_rejected:
-            line = f"view '{name}' stalls: no detection has come since MEASURE"
+            line = f"view '{name}' stalls: no detection has arrived since MEASURE"
         else:
-            missing = missing_marks(status) or "nothing, but it is not called complete"
+            missing = missing_marks(status) or "nothing, but it is not reported complete"
             line = f"view '{name}' stalls at {100 * self.coverage:.1f} %: missing {missing}"
         collector = self.presence.of("measurement_collector")
         if collector is None:
             return line + "; measurement_collector gives no sign of life"
         return line + (f"; measurement_collector: {collector.message}" if collector.level else
-                       "; redo_view measures it again, skip_view goes on without")
+                       "; redo_view measures it again, skip_view continues without it")
 
     def _time_out(self) -> None:
         self._ports.say(Level.WARN, f"view {self._view_name} is not complete in time")

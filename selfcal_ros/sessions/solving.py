@@ -171,9 +171,9 @@ class SolvingSession:
             if self._messages and not (supersedes(run, self._run)
                                        or begins_in_future(self._run, now_ns)):
                 if begun_ns(run.run_id) is None:
-                    raise InputError(MEASUREMENT_TOPIC, "readings of a run that does not say when "
-                                     f"it began, while run {self._run.run_id} is known: not used",
-                                     "let the commands carry run_id, or restart the solver")
+                    raise InputError(MEASUREMENT_TOPIC, "readings without a run_id, while "
+                                     f"run {self._run.run_id} is known: not used",
+                                     "set run_id in the commands, or restart the solver")
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}
@@ -362,7 +362,7 @@ class SolvingSession:
             return ""
         run = max(later, key=lambda item: item[0])[1]
         return (f"the newer run {run.run_id} of plan '{run.plan_id}' is not in this map: none of "
-                "its readings has come; the health of measurement_collector says why")
+                "its readings has arrived; the health of measurement_collector says why")
 
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and log it."""

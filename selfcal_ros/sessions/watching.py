@@ -77,11 +77,11 @@ class Watch:
                 "summary": self._summed(), "map": self._mapped()}
 
     def _health(self, node: str) -> dict[str, Any] | None:
-        told = self._presence.of(node)
-        return None if told is None else {
-            "level": int(told.level), "message": printable(told.message), "values": {
+        health = self._presence.of(node)
+        return None if health is None else {
+            "level": int(health.level), "message": printable(health.message), "values": {
                 printable(key): printable(value) for key, value
-                in islice(told.values.items(), MOST_ENTRIES)}}
+                in islice(health.values.items(), MOST_ENTRIES)}}
 
     def _commanded(self) -> dict[str, Any] | None:
         command = self._command

@@ -45,8 +45,8 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
     InputError
         If the folder exists, or cannot be created or written.
     """
-    with new_bag(path) as beside:
-        return _write(simulation, beside, progress)
+    with new_bag(path) as unfinished:
+        return _write(simulation, unfinished, progress)
 
 
 def _write(simulation: Simulation, path: Path,

@@ -360,8 +360,8 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
     if encoder == "independent":
         return drawn - drawn.mean()
     if artifact.angular_count % 4:
-        raise InputError("encoder xy_axes", f"of {artifact.angular_count} lines none lies on the y "
-                         "axis", "use independent")
+        raise InputError("encoder xy_axes", f"of {artifact.angular_count} lines, none lies on the "
+                         "y axis", "use independent")
     slopes = half_axis_slopes(artifact, g)  # a half axis of one site has no slope
     quarter = drawn[:: artifact.angular_count // 4]
     quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)

@@ -294,8 +294,8 @@ def line_directions(truth: Truth, index: int, view: View,
     lies = truth.placed_as(index, view).on_stage(truth.artifact).s
     nearest = np.rint(turn - lies)
     line = nearest.astype(int) % count
-    beside = (nearest - (turn - lies)) * (2 * np.pi / count)
-    direction = nominal + (truth.a_theta[line] + truth.phi_rad[index] + beside)
+    deviation = (nearest - (turn - lies)) * (2 * np.pi / count)
+    direction = nominal + (truth.a_theta[line] + truth.phi_rad[index] + deviation)
     if len(truth.line_eccentricity_rad):
         x, y = truth.line_eccentricity_rad[index]
         cos, sin = np.cos(direction), np.sin(direction)

@@ -14,7 +14,7 @@ from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.images import Picture, decoded, picture_of
 
 SETTLED = 3
-"""Images in a row that settle the size of all."""
+"""Consecutive images that fix the size for all."""
 
 MOST_STAMPS = 100_000
 """Most stamps that are kept to refuse repeated images: an hour of 30 a second."""
@@ -73,7 +73,7 @@ class ImageDetector:
         ------
         InputError
             If the image cannot be used, which is counted: unknown encoding, damaged, another size,
-            the stamp of an image before.
+            the stamp of an earlier image.
         """
         return self._detect(lambda: picture_of(message), stamp_ns(message), "image")
 
@@ -105,12 +105,12 @@ class ImageDetector:
         other image. Which of them count, the collector judges.
         """
         if stamp in self._stamps:
-            raise InputError(name, "its stamp is that of an image before",
+            raise InputError(name, "its stamp is that of an earlier image",
                              "stamp each exposure by its own instant")
         shape = picture.values.shape
         if not self._size.agrees(shape):
             old, new = (f"{size[1]} x {size[0]}" for size in (self._size.shape, shape))
-            raise InputError(name, f"{new} pixels, but the images before have {old}",
+            raise InputError(name, f"{new} pixels, but earlier images have {old}",
                              "record images of one size; the optical axis is their centre")
 
 

@@ -99,8 +99,8 @@ def test_how_far_ahead_of_its_logging_a_stamp_may_lie(tmp_path, late_s, refused)
 
 
 @pytest.mark.parametrize("received_ns, lines", [
-    (START_NS, [f"{COMMAND_TOPIC}: stamped more than 60 s ahead of its logging: a live collector "
-                "refuses that; set the clock that stamps, or the recorder's"]), (0, [])])
+    (START_NS, [f"{COMMAND_TOPIC}: stamped more than 60 s ahead of its log time: a live collector "
+                "refuses it; set the clock that stamps, or the recorder's"]), (0, [])])
 def test_a_bag_whose_times_of_logging_are_of_another_clock_is_read_by_its_stamps(
         tmp_path, received_ns, lines):
     found = collect_bag(recorded(tmp_path, AHEAD, received_ns), SETTINGS)

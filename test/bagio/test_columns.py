@@ -107,7 +107,7 @@ def test_without_definitions_only_a_type_of_one_length_may_have_a_tail(tmp_path,
     assert (found, sorted(lost)) == (one_by_one(path)[0], sorted(one_by_one(path)[1]))
     n_found = sum(text.startswith("EncoderSample") for text in found)
     assert n_found == n_samples
-    assert any("messages on stage/mark_detections could not be decoded: the bag holds no" in line
+    assert any("messages on stage/mark_detections could not be decoded: the bag has no" in line
                for line in lost)
 
 

@@ -159,7 +159,7 @@ def test_a_bomb_that_is_cut_off_gives_nothing(tmp_path, events, tight, name, pac
     path.write_bytes(data[:at] + bomb_chunk(name, 5 * tight)[:-7])
     reader = BagReader(path)
     assert sum(1 for _ in decoded(reader)) == len(events)
-    assert "0 messages of the last chunk could be saved" in reader.lost[0]
+    assert "0 messages of the last chunk were recovered" in reader.lost[0]
 
 
 def test_a_compressed_message_that_is_a_bomb_is_counted(tmp_path, events, tight):

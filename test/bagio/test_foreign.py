@@ -197,7 +197,7 @@ def test_without_definitions_what_does_not_fit_is_said(tmp_path, events):
     assert {topic for topic, *_ in decoded(reader)} == {"stage/joint_states"}
     n_seen = sum(isinstance(event, Detection) for event in events)
     assert sorted(reader.lost) == [
-        f"{count} messages on {topic} could not be decoded: the bag holds no definition of {name}, "
+        f"{count} messages on {topic} could not be decoded: the bag has no definition of {name}, "
         "and they do not fit the one known here"
         for count, topic, name in ((n_seen, "stage/mark_detections", bags.DETECTION_TYPE),
                                    (9, "selfcal/view_command", bags.COMMAND_TYPE))]
@@ -275,7 +275,7 @@ def test_a_compressed_file_that_is_damaged_is_read_as_far_as_it_goes(tmp_path, s
     assert 100 < len(list(decoded(reader))) < len(events)
     assert reader.lost
     file.write_bytes(data[:100])
-    with pytest.raises(InputError, match="nothing of the compressed file can be read; record"):
+    with pytest.raises(InputError, match="no part of the compressed file can be read; record"):
         solved(bag)
 
 

@@ -315,7 +315,7 @@ def test_a_full_disk_is_said_and_leaves_no_half_message(tmp_path, monkeypatch, n
 
     monkeypatch.setattr(journal_file.os, "write", full)
     with pytest.raises(InputError, match=r"the journal cannot be written \(No space left on "
-                       r"device\); make room or name another folder$"):
+                       r"device\); free some space or name another folder$"):
         record(writer, samples(3, 100))
     assert writer.n_lost == 3
     monkeypatch.undo()

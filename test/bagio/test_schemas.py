@@ -54,7 +54,7 @@ def test_a_schema_is_read_anew_where_any_of_it_differs_and_refused_wherever_it_s
         assert (name in store.fielddefs) == (name == "pkg/msg/T")
     for where in ("bag 1", "bag 2"):
         with pytest.raises(InputError, match=rf"^{where}: the definition of pkg/msg/T cannot be "
-                           r"read \(.+\); record the bag anew$"):
+                           r"read \(.+\); record the bag again$"):
             store_of_schema("pkg/msg/T", "ros2msg", "float64", where)
 
 
@@ -70,7 +70,7 @@ def test_common_types_are_those_of_jazzy(name):
 
 
 def test_a_type_that_nobody_knows_is_refused():
-    with pytest.raises(InputError, match=r"^bag: the bag holds no definition of a/msg/B; record it "
+    with pytest.raises(InputError, match=r"^bag: the bag has no definition of a/msg/B; record it "
                        r"with message definitions$"):
         store_of_schema("a/msg/B", "", "", "bag")
     with pytest.raises(InputError, match=r"^topic t: no definition of a/msg/B; record only topics "

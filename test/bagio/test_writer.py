@@ -236,7 +236,7 @@ def test_a_full_disk_is_one_line(tmp_path, act):
     writer.write("/notes", {"data": "x"}, 1)
     writer._mcap._Writer__stream = FullDisk(writer._file)
     with pytest.raises(InputError, match=r"bag: cannot be written \(No space left on device\); "
-                       "make room or name another folder"):
+                       "free some space or name another folder"):
         {"flush": writer.flush, "close": writer.close,
          "write": lambda: writer.write("/notes", {"data": "x" * 300_000}, 1)}[act]()
     writer._file.close()

@@ -180,7 +180,7 @@ def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
     with opened(tmp_path / "out"):
         assert batch(shelf / "a.mcap", "-o", tmp_path / "out") == 2
     assert capsys.readouterr().err == (f"selfcal batch: {tmp_path / 'out'}: another batch works in "
-                                       "this folder; wait for its end or name another folder\n")
+                                       "this folder; wait for it to end or name another folder\n")
 
 
 @pytest.mark.parametrize(("options", "message"), [

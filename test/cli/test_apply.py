@@ -117,7 +117,7 @@ def test_a_bad_table_is_one_line(desk, capsys, text, message):
 
 def test_outside_refused_and_not_qualified(desk, capsys):
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
-    assert "outside of the calibrated field" in capsys.readouterr().err
+    assert "outside the calibrated field" in capsys.readouterr().err
     doubt = replace(result_of(MAP), verdict=Verdict(
         Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))
     write_json("R.json", result_to_dict(doubt))
@@ -136,4 +136,4 @@ def test_bicubic_is_advised_where_it_halves_u_between_the_nodes(desk, capsys):
         write_json("R.json", result_to_dict(result_of(replace(
             emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u))))
         assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 0
-        assert ("--method bicubic has" in capsys.readouterr().err) is advised
+        assert ("with --method bicubic" in capsys.readouterr().err) is advised

@@ -391,14 +391,14 @@ def test_all_outputs_of_an_export_are_checked_first(run, tmp_path):
     one_line(err, "no/t.cal: cannot be written")
     code, _, err = run("export", "r.json", "-o", "r.json", "--force")
     assert code == 2
-    one_line(err, "r.json: would be written over")
+    one_line(err, "r.json: would be overwritten")
     (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
     for verb, source in (("orthogonality", "r.json"), ("accuracy", "r.json"),
                          ("straightness", "d.csv")):
         before = (tmp_path / source).read_bytes()
         code, _, err = run(verb, source, "-o", source, "--force")
         assert code == 2 and (tmp_path / source).read_bytes() == before
-        one_line(err, f"{source}: would be written over")
+        one_line(err, f"{source}: would be overwritten")
 
 
 def test_bad_paths_and_bad_plots(run, tmp_path):
@@ -409,7 +409,7 @@ def test_bad_paths_and_bad_plots(run, tmp_path):
                           (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
                           (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
                           (["verify", "r.json", "f.cal", "--plot", "f.gif"],
-                           "no kind of picture by its ending")):
+                           "not a picture format by its suffix")):
         code, _, err = run(*args)
         assert code == 2
         one_line(err, message)

@@ -141,7 +141,7 @@ HEAD = "x,y,gx,gy,u_gx,u_gy\n"
     (HEAD, "x.csv: no site has an error and its uncertainty"),
     (HEAD + "0,0,0,0,1\n", "x.csv:2: 5 cells, not 6"),
     (HEAD + "0,0,a,0,1e-8,1e-8\n", "x.csv:2: a cell is not a number"),
-    (HEAD + "0,0,0,0,1e-8,0\n", "x.csv:2: u_gy 0 is no standard uncertainty"),
+    (HEAD + "0,0,0,0,1e-8,0\n", "x.csv:2: u_gy 0 is not a standard uncertainty"),
     (HEAD + "0.001,0,0,0,1e-8,1e-8\n", "(0.001, 0) m is no site of the other maps"),
     (HEAD + "0.03,0,0,0,1e-8,1e-8\n", "(0.03, 0) m is no site of the other maps"),
     (HEAD + "0,0,0,0,1e-8,1e-8\n" * 2, "x.csv:3: its site is in the table twice"),
@@ -160,7 +160,7 @@ def test_maps_alone_give_no_lattice(files, capsys):
     assert main(["combine", "a.csv", "b.csv", "-o", "mean.json"]) == 2
     assert "no RESULT.json is named" in capsys.readouterr().err
     assert main(["combine", "1.json", "-o", "1.json"]) == 2
-    assert "would be written over" in capsys.readouterr().err
+    assert "would be overwritten" in capsys.readouterr().err
 
 
 def test_the_mean_goes_to_stdout(files, capsys):

@@ -214,7 +214,7 @@ def test_the_table_of_a_result(tmp_path, capsys):
     np.testing.assert_array_equal(arrays["gx"], emap.gx)
     np.testing.assert_array_equal(arrays["ay"], result.artifact_map.ay)
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.txt")]) == 2
-    assert capsys.readouterr().err == (f"selfcal table: {tmp_path / 't.txt'}: its ending is not "
+    assert capsys.readouterr().err == (f"selfcal table: {tmp_path / 't.txt'}: its suffix is not "
                                        "that of a table; name a file that ends in .csv or .npz, "
                                        "or - for stdout\n")
     text = (tmp_path / "t.csv").read_text()
@@ -337,5 +337,5 @@ def test_a_picture_of_no_kind(tmp_path, capsys):
     write_json(tmp_path / "r.json", result_to_dict(known_result(5, 8)[0]))
     assert main(["plot", str(tmp_path / "r.json"), "-o", str(tmp_path / "a.gif")]) == 2
     assert capsys.readouterr() == ("", (
-        f"selfcal plot: {tmp_path / 'a.gif'}: no kind of picture by its ending; name a file that "
+        f"selfcal plot: {tmp_path / 'a.gif'}: not a picture format by its suffix; name a file that "
         "ends in .png, .svg or .pdf\n"))

@@ -165,9 +165,9 @@ def test_bad_images_give_one_line_each_and_lose_nothing_else(bag, tmp_path, caps
         "14 marks in 15 images; 1 images without marks; 4 images refused")
     lines = printed.err.splitlines()
     assert len(lines) == 5
-    for text in ("encoding 'yuv422'", "72 x 63 pixels, but the images before have 72 x 64",
+    for text in ("encoding 'yuv422'", "72 x 63 pixels, but earlier images have 72 x 64",
                  "100 bytes in rows of 72", "messages on /stage/image could not be decoded",
-                 "its stamp is that of an image before"):
+                 "its stamp is that of an earlier image"):
         assert sum(text in line for line in lines) == 1
     assert len(contents(tmp_path / "found", f"/{DETECTION_TOPIC}")) == 14
 
@@ -258,8 +258,8 @@ def own_values(data):
 @pytest.mark.parametrize("table, problem", [
     ("file,view,x\n", "no column 'y'; begin with the line file,view,x,y"),
     ("file,view,x,y\na.png,tilted,0,0\n", ":2: the plan has no view 'tilted'"),
-    ("file,view,x,y\n\na.png,shift,0,far\n", ":3: 'far' is no position"),
-    ("file,view,x,y\na.png,shift,nan,0\n", ":2: 'nan' is no position"),
+    ("file,view,x,y\n\na.png,shift,0,far\n", ":3: 'far' is not a position"),
+    ("file,view,x,y\na.png,shift,nan,0\n", ":2: 'nan' is not a position"),
     ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell"),
     ("\ufefffile,view,x,y\r\na.png,,0,0\r\n", ":2: an empty cell"),
     ("file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n", ":4: a.png is in line 2 as well"),
@@ -297,7 +297,7 @@ def test_missing_and_damaged_files_are_one_line_each(tmp_path, capsys):
     damaged, missing, other_size = printed.err.splitlines()
     assert "a.png: not an image, or damaged; give PNG, JPEG or TIFF" in damaged
     assert "b.png: no such file" in missing
-    assert "d.png: 60 x 50 pixels, but the images before have 60 x 60" in other_size
+    assert "d.png: 60 x 50 pixels, but earlier images have 60 x 60" in other_size
     assert "0 marks in 1 images" in printed.out
 
 

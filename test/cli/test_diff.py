@@ -64,7 +64,7 @@ def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monke
     np.testing.assert_array_equal(of_both.gy, found.dy)
     np.testing.assert_array_equal(of_both.u_gx, np.hypot(a.error_map.u_gx, b.error_map.u_gx))
     assert main(["diff", *files, "--plot", files[0]]) == 2
-    assert "would be written over" in capsys.readouterr().err
+    assert "would be overwritten" in capsys.readouterr().err
 
 
 def test_two_results_as_text_and_as_json(files, capsys):

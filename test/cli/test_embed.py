@@ -90,15 +90,15 @@ def test_a_name_is_taken_once(bag, tmp_path):
     attach(bag, [("a.txt", "text/plain", b"1")], 1)
     before = file_in(bag).read_bytes()
     for items in ([("a.txt", "text/plain", b"2")], [("b", "", b""), ("b", "", b"")]):
-        with pytest.raises(InputError, match="is in the bag already"):
+        with pytest.raises(InputError, match="is already in the bag"):
             attach(bag, items, 1)
     assert file_in(bag).read_bytes() == before and attached(bag) == {"a.txt": b"1"}
 
 
 @pytest.mark.parametrize(("spoil", "message"), [
-    (lambda raw: raw[:-20], "no MCAP file with a summary"),
-    (lambda raw: raw[:40], "no MCAP file with a summary"),
-    (lambda raw: b"", "no MCAP file with a summary"),
+    (lambda raw: raw[:-20], "not an MCAP file with a summary"),
+    (lambda raw: raw[:40], "not an MCAP file with a summary"),
+    (lambda raw: b"", "not an MCAP file with a summary"),
     (lambda raw: raw.replace(b"kept as it is", b"kept as it was"[:13]), "an attachment is damaged"),
 ])
 def test_a_file_that_was_not_closed_or_is_damaged_is_refused(bag, spoil, message):
@@ -127,7 +127,7 @@ def test_no_damage_of_the_end_is_more_than_one_line(bag):
 
 def test_files_and_extract_exclude_each_other(bag, capsys):
     assert main(["embed", str(bag), "x.json", "--extract", "."]) == 2
-    assert "files are named, too" in capsys.readouterr().err
+    assert "files are named as well" in capsys.readouterr().err
     assert main(["embed", str(bag / "missing")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -175,7 +175,7 @@ def test_a_file_without_any_summary_is_left_alone(tmp_path):
     path = foreign(tmp_path / "a.mcap", use_statistics=False, use_summary_offsets=False,
                    index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False)
     before = path.read_bytes()
-    with pytest.raises(InputError, match="no MCAP file with a summary"):
+    with pytest.raises(InputError, match="not an MCAP file with a summary"):
         attach(path, [("a", "", b"")], 1)
     assert path.read_bytes() == before
 
@@ -220,7 +220,7 @@ def test_a_file_with_other_content_is_not_written_over(tmp_path, capsys):
     out.mkdir()
     (out / "y.txt").write_text("newer")
     assert main(["embed", str(path), "--extract", str(out)]) == 2
-    assert "y.txt: the file exists and has other content; extract to" in capsys.readouterr().err
+    assert "y.txt: the file exists with other contents; extract to" in capsys.readouterr().err
     assert (out / "y.txt").read_text() == "newer" and not (out / "x.txt").exists()
     (out / "y.txt").write_bytes(b"1")
     assert main(["embed", str(path), "--extract", str(out)]) == 0

@@ -75,7 +75,7 @@ def test_onto_combines_with_the_active_table(capsys):
     ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
     ("pmac R.json -o t.txt --counts-per-unit 1=5", "--counts-per-unit: it is given for [1]"),
     ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
-    ("kmotion R.json -o R.json", "R.json: would be written over"),
+    ("kmotion R.json -o R.json", "R.json: would be overwritten"),
     ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
     ("siemens R.json -o t.txt --y-axis 1", "axes: the indices [1, 1] are not distinct")])
 def test_what_is_not_possible_is_one_line(capsys, line, message):

@@ -57,7 +57,7 @@ def test_inches_without_a_word_for_them_are_told(capsys):
 
 
 @pytest.mark.parametrize(("line", "message"), [
-    ("in.nc R.json -o in.nc", "in.nc: would be written over"),
+    ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
     ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
     ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
     ("bad.nc R.json -o o.nc", "bad.nc:1: G92 moves the coordinates")])

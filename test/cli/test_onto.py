@@ -63,7 +63,7 @@ def test_cal_export_replaces_the_active_table(tmp_path, monkeypatch, capsys, opt
     measured(machine, old)
     words = f"R.json -o new.cal --onto old.cal {options}".split()
     assert main(["cal", "export", *words]) == 0
-    assert "bends between the nodes" in capsys.readouterr().err
+    assert "is curved between the nodes" in capsys.readouterr().err
     text = Path("new.cal").read_text()
     new = cal([text], None)
     assert f":START2D {row} {column} {column} {row} " in text

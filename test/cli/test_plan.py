@@ -68,7 +68,7 @@ def test_check_tells_what_nothing_checks(tmp_path, capsys):
 def test_check_in_words(capsys):
     assert main(["plan", "check", shipped("deficient_shifts")]) == 3
     text = capsys.readouterr().out
-    assert "rank 491 of 493 unknowns, 2 unseen modes" in text
+    assert "rank 491 of 493 unknowns, 2 undetermined modes" in text
     assert "  - non-orthogonality of the axes" in text and "  - add a view turned by 90 deg" in text
     assert main(["plan", "check", shipped("hu"), "--map"]) == 0
     text = capsys.readouterr().out
@@ -91,7 +91,7 @@ def test_nodes_that_stay_unknown_are_counted(tmp_path, capsys):
     assert (found["unknown_sites"], found["deficiency"]) == (36, 0)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(2.010, abs=1e-3)
     assert main(["plan", "check", path]) == 0
-    assert "at 45 of 81 nodes of the map: the other 36 stay unknown" in capsys.readouterr().out
+    assert "at 45 of 81 nodes of the map: the other 36 remain unknown" in capsys.readouterr().out
     assert main(["simulate", str(tmp_path / "spec.yaml"), "-o", bag]) == 0
     assert main(["solve", bag, "-o", out, "--model", "none"]) == 0
     assert "Calibrated at 45 of 81 sites from 3 views" in capsys.readouterr().out
@@ -244,7 +244,7 @@ def test_suggest_next_views(capsys, tmp_path):
     assert len(plan.views) == 4 and plan.views[-1].name == first["view"]["name"]
     assert main(["plan", "suggest", shipped("deficient_qiao_180")]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("plan deficient_qiao_180: 10 unseen modes\n")
+    assert text.startswith("plan deficient_qiao_180: 10 undetermined modes\n")
 
 
 def test_suggest_against_terms(capsys, tmp_path):
@@ -299,7 +299,7 @@ def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_bytes(Path(shipped("qiao")).read_bytes())
     assert main(["plan", "suggest", str(plan), "-o", str(plan)]) == 2
-    assert "would be written over" in capsys.readouterr().err
+    assert "would be overwritten" in capsys.readouterr().err
     assert plan.read_bytes() == Path(shipped("qiao")).read_bytes()
 
 

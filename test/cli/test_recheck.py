@@ -57,8 +57,8 @@ def test_a_stage_that_is_as_it_was(folder, capsys):
 def test_the_calibrations_own_recording_is_refused(folder, capsys):
     assert main(["recheck", str(folder / "r.json"), str(folder / "first")]) == 2
     assert capsys.readouterr().err == (
-        f"selfcal recheck: {folder / 'first'}: the recording that {folder / 'r.json'} was made of: "
-        "it would be compared with itself; record a new view of the plate\n")
+        f"selfcal recheck: {folder / 'first'}: the recording that {folder / 'r.json'} was computed "
+        "from: it would be compared with itself; record a new view of the plate\n")
 
 
 def test_a_stage_that_has_changed(folder, capsys):
@@ -124,7 +124,7 @@ def test_nodes_that_a_shifted_plate_does_not_reach_are_counted(folder, capsys):
     assert main(["plan", "check", str(folder / "beside.yaml"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["unknown_sites"] == 5
     assert main(["plan", "check", str(folder / "beside.yaml")]) == 0
-    assert "\n5 of 25 nodes of the map stay unknown\n" in capsys.readouterr().out
+    assert "\n5 of 25 nodes of the map remain unknown\n" in capsys.readouterr().out
 
 
 def test_plans_without_the_result_that_they_name(folder, tmp_path, capsys):

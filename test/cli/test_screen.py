@@ -32,7 +32,7 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
 
 
 @pytest.mark.parametrize("sequencer, sentence", [
-    (None, "pose_sequencer is not there: start it, or wait for it."),
+    (None, "pose_sequencer is not running: start it, or wait for it."),
     (told("IDLE"), "Press s to start the plan."),
     (told("IDLE", "waiting for solver (no sign of life)", 1),
      "Nothing: waiting for solver (no sign of life)."),
@@ -40,12 +40,12 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
                                          "10 mm, y -20 mm; then press c."),
     (told("MEASURING"), "Nothing: the view is being measured."),
     (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
-    (told("PLACING", "no sign of life of solver", 1),
+    (told("PLACING", "no sign of life from solver", 1),
      f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 mm; then press c. "
-     "Look: no sign of life of solver."),
+     "Look: no sign of life from solver."),
     (told("DONE"), "Done. s starts another run."),
     (told("ABORTED"), "Aborted. s starts a new run."),
-    (told("FOLLOWING"), "Nothing: another sequencer commands; a ends that.")])
+    (told("FOLLOWING"), "Nothing: another sequencer is in command; a ends that.")])
 def test_what_a_person_has_to_do(sequencer, sentence):
     assert what_now(EMPTY | {"health": {"pose_sequencer": sequencer},
                              "command": COMMAND}) == sentence
@@ -173,7 +173,7 @@ def test_what_there_is_no_room_for_is_counted(size):
     assert f"{12 - len(reasons)} more row" in text
     assert "reason_11" in reasons[0]  # the most frequent first
     assert "missing lines 0, 1, 2" in text and "and 90 more" in text
-    assert "pose_sequencer is not there" in text
+    assert "pose_sequencer is not running" in text
 
 
 def test_a_small_terminal_says_what_is_to_be_done_and_asks_for_more_room():

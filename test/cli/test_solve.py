@@ -84,7 +84,7 @@ def test_what_is_no_bag(tmp_path, capsys):
     lines = [refused(capsys, 2, path) for path in (text, empty, folder, tmp_path / "none")]
     assert lines == [
         f"{text}: not an MCAP file; give an .mcap file or a rosbag2 folder",
-        f"{empty}: the file is empty; record the bag anew",
+        f"{empty}: the file is empty; record the bag again",
         f"{folder}: no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP "
         "storage",
         f"{tmp_path / 'none'}: no such file or folder; check the path"]
@@ -173,7 +173,7 @@ def test_nothing_usable(tmp_path, capsys, events):
     assert (f"none of {count} detections became a reading (rejected: no_encoder_sample_near "
             f"{count})") in line
     assert line.strip().endswith("the detections are stamped about 1000 s after the encoder "
-                                 "samples; let both be stamped by one clock")
+                                 "samples; stamp both by one clock")
 
 
 def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
@@ -181,8 +181,8 @@ def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith(
         "selfcal solve: bags/hu_noise: 1745 of 2240 detections were rejected as "
-        "stage_not_at_mark: the stage is indicated at minus the marks' sites; the sense is the "
-        "other one: measurement_sense microscope_moves (--sense microscope_moves)")
+        "stage_not_at_mark: the stage is indicated at minus the marks' sites; the sense is "
+        "reversed: measurement_sense microscope_moves (--sense microscope_moves)")
     assert last.startswith("selfcal solve: bags/hu_noise: correct this first; as it is, the marks "
                            "that were read do not identify the stage")
 
@@ -333,7 +333,7 @@ def test_the_measurement_is_never_written_over(tmp_path, capsys):
     before = [part.read_bytes() for part in parts]
     for target in parts:
         assert solve(bag, output=target) == 2
-        assert f"{target.name}: would be written over; name another" in capsys.readouterr().err
+        assert f"{target.name}: would be overwritten; name another" in capsys.readouterr().err
     assert solve(bag, output=tmp_path / "none" / "r.json") == 2
     assert "cannot be written (No such file or directory)" in capsys.readouterr().err
     assert [part.read_bytes() for part in parts] == before

@@ -114,15 +114,15 @@ def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
 
 
 @pytest.mark.parametrize(("args", "message"), [
-    (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be written over"),
-    (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be written"),
+    (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be overwritten"),
+    (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be over"),
     (("d.csv", "--method", "new", "-o", "no/a.json", "--cal", "a.cal"), "no/a.json: cannot be wr"),
     (("d.csv", "--method", "new", "-o", "a.json", "--plot", "a.png", "--cal", "old.cal"),
      "old.cal: the file exists"),
     (("d.csv", "--method", "new", "--save-csv", "a.csv"), "--save-csv: nothing would be written"),
     (("d.csv", "--method", "new", "--truth", "a.json"), "--truth: nothing would be written"),
-    (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be written over"),
-    (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be written"),
+    (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be overwritten"),
+    (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be over"),
     (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
     (("--simulate", "s.yaml", "--cal", "a.cal"), "--cal: nothing would be written"),
 ])
@@ -188,7 +188,7 @@ def test_data_and_method_belong_together(capsys):
 
 def test_a_picture_has_a_known_format(tmp_path, capsys):
     code, _, err = run(capsys, EXAMPLE, "--method", "new", "--plot", tmp_path / "p.gif")
-    assert code == 2 and "by its ending; name a file that ends in .png, .svg or .pdf" in err
+    assert code == 2 and "by its suffix; name a file that ends in .png, .svg or .pdf" in err
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):
@@ -275,7 +275,7 @@ def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
                                    atol=1e-11)
     assert run(capsys, "--simulate", CONFIG / "case_study.yaml")[1] == table.read_text()
     code, _, err = run(capsys, EXAMPLE, "--simulate", CONFIG / "case_study.yaml")
-    assert code == 2 and "makes data and reads none" in err
+    assert code == 2 and "writes data and reads none" in err
 
 
 def test_the_body_diagonals_of_the_example(tmp_path, capsys):

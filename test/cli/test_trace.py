@@ -103,7 +103,7 @@ def test_a_folder_is_moved_with_its_records(here, tmp_path, capsys, monkeypatch)
     here.rename(tmp_path / "moved" / "work")
     monkeypatch.chdir(tmp_path)
     assert main(["trace", "moved/work/t.csv"]) == 0
-    assert "t.csv: unchanged, of moved/work/r.json (SHA-256 " in capsys.readouterr().out
+    assert "t.csv: unchanged, from moved/work/r.json (SHA-256 " in capsys.readouterr().out
 
 
 def test_a_bag_with_result_and_exports_is_complete(here, capsys):
@@ -118,7 +118,7 @@ def test_a_bag_with_result_and_exports_is_complete(here, capsys):
     assert main(["trace", "bag"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert [line.split(" (")[0] for line in said] == [
-        f"bag/{name}: unchanged, of r.json" for name in ("k.txt", "t.csv")]
+        f"bag/{name}: unchanged, from r.json" for name in ("k.txt", "t.csv")]
 
 
 def test_an_edited_export_is_not_embedded(here, capsys):
@@ -133,7 +133,7 @@ def test_an_edited_export_is_not_embedded(here, capsys):
     ('{"schema": "selfcal.origin/1", "file": 1}', "not a record"),
     ('{"schema": "selfcal.origin/1", "file": "", "sha256": "", "created": "", "command": "", '
      '"result": {"file": 3}}', "not a record"),
-    (None, "has no record t.csv.origin.json beside it; export it again")])
+    (None, "has no record t.csv.origin.json next to it; export it again")])
 def test_what_is_no_record_is_one_line(record, message, here, capsys):
     Path("t.csv").write_text("x\n")
     if record is not None:

@@ -228,7 +228,7 @@ def test_one_plan_has_one_plate():
              for c in cell.commands]
     wider = [replace(c, view=replace(c.view, translation_m=(0.0, 0.0))) if c.view else c
              for c in wider]
-    with pytest.raises(InputError, match="describes another plate than the rest of plan '0, 90'"):
+    with pytest.raises(InputError, match="a different plate from the rest of plan '0, 90'"):
         collect([*wider, *cell.samples, *cell.detections])
 
 

@@ -15,12 +15,12 @@ ODD = [
      "beyond every field; is it in mm? give the translation in metres"),
     ({"translation_m": (0.0, -1e300)}, {}, "view '0' translation: -"),
     ({"grid": False, "angular": False}, {},
-     "view command 0: neither grid nor angular marks are wanted; set one to true"),
+     "view command 0: neither grid nor angular marks are requested; set one to true"),
     ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
     ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
     ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 1000 views; "),
     ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 1000 views; correct"),
-    ({}, {"view": None}, "view command 0: it describes no view; fill its pose and its plate"),
+    ({}, {"view": None}, "view command 0: it describes no view; fill in its pose and its plate"),
 ]
 
 

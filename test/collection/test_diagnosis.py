@@ -59,12 +59,12 @@ def test_joints_of_other_names_are_named():
     cell.samples = [replace(s, names=("X1", "Y1", "theta")) for s in cell.samples]
     assert findings(cell.events) == {None: (
         "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample of the "
-        "joint 'x', 'y' came; names that came: 'theta', 'X1', 'Y1'; set joint_x, joint_y, "
+        "joint 'x', 'y' arrived; joints received: 'theta', 'X1', 'Y1'; set joint_x, joint_y, "
         "joint_theta")}
     cell.samples = [replace(s, names=("x", "Y1", "theta")) for s in cell.samples]
-    assert "'y' came; names that came: 'x', 'theta', 'Y1';" in findings(cell.events)[None]
+    assert "'y' arrived; joints received: 'x', 'theta', 'Y1';" in findings(cell.events)[None]
     cell.samples = []
-    assert "of the joint 'x', 'y' came; names that came: none;" in findings(cell.events)[None]
+    assert "of the joint 'x', 'y' arrived; joints received: none;" in findings(cell.events)[None]
 
 
 def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
@@ -77,7 +77,7 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
         assert list(found) == [1]
         assert found[1].startswith(
             "8 of 8 detections were rejected as no_encoder_sample_near: no encoder sample of the "
-            f"joint 'theta' came; names that came: {came};")
+            f"joint 'theta' arrived; joints received: {came};")
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -88,7 +88,7 @@ def test_the_other_sense(sense):
         "not by 0° (or its ids are those of other marks); turn it as planned and measure this view "
         "again, or correct its pose in the plan; or, if it lies as planned: the stage is indicated "
         "at minus the marks' sites; the "
-        f"sense is the other one: measurement_sense {sense} (--sense {sense})")}
+        f"sense is reversed: measurement_sense {sense} (--sense {sense})")}
 
 
 def test_the_only_view_asks_for_the_pose_before_the_joints():
@@ -100,12 +100,12 @@ def test_the_only_view_asks_for_the_pose_before_the_joints():
 
 @pytest.mark.parametrize(("change", "text"), [
     (lambda x, y: (y, x), "x and y are exchanged; exchange joint_x and joint_y"),
-    (lambda x, y: (-x, y), "x is indicated with the wrong sign; turn the sign of x"),
-    (lambda x, y: (x, -y), "y is indicated with the wrong sign; turn the sign of y"),
-    (lambda x, y: (1e3 * x, 1e3 * y), "the indicated positions are 1000 times what the marks ask "
-     "for: they are in mm; publish joint positions in metres"),
-    (lambda x, y: (1e6 * x, 1e6 * y), "a million times what the marks ask for: they are in µm"),
-    (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of what the marks ask for"),
+    (lambda x, y: (-x, y), "x is indicated with the wrong sign; reverse the sign of x"),
+    (lambda x, y: (x, -y), "y is indicated with the wrong sign; reverse the sign of y"),
+    (lambda x, y: (1e3 * x, 1e3 * y), "the indicated positions are 1000 times those of the "
+     "marks: they are in mm; publish joint positions in metres"),
+    (lambda x, y: (1e6 * x, 1e6 * y), "a million times those of the marks: they are in µm"),
+    (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of those of the marks"),
     (lambda x, y: (1e3 * y, 1e3 * x), "they are in mm and x and y are exchanged; publish joint "
      "positions in metres, and exchange joint_x and joint_y")])
 def test_positions_that_are_not_what_they_should_be(change, text):
@@ -118,7 +118,7 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
     cell = scene(placed_plan(5), servo_sigma_m=0.0)
     assert findings(cell.events) == {}
     found = findings(with_positions(cell, lambda x, y: (-x, y)))[None]
-    assert found.endswith("x is indicated with the wrong sign; turn the sign of x")
+    assert found.endswith("x is indicated with the wrong sign; reverse the sign of x")
 
 
 @pytest.mark.parametrize(("deg", "shift", "text"), [
@@ -236,7 +236,7 @@ def test_joint_states_that_cannot_be_used(positions, said):
 def test_positions_that_nothing_explains():
     found = findings(with_positions(scene(count=0), lambda x, y: (x + 0.05, 2 * y)))[None]
     assert "the stage stands 0.0" in found
-    assert "m from the sites of the marks that are seen (median); check joint_x" in found
+    assert "m from the sites of the detected marks (median); check joint_x" in found
 
 
 @pytest.mark.parametrize(("ahead_s", "side"), [(5.0, "after"), (37.0, "after"),
@@ -247,7 +247,7 @@ def test_a_clock_of_its_own(ahead_s, side):
     cell.samples = [replace(s, stamp_ns=s.stamp_ns - shift) for s in cell.samples]
     assert findings(cell.events) == {None: (
         "25 of 25 detections were rejected as no_encoder_sample_near: the detections are stamped "
-        f"about {abs(ahead_s):g} s {side} the encoder samples; let both be stamped by one clock")}
+        f"about {abs(ahead_s):g} s {side} the encoder samples; stamp both by one clock")}
 
 
 @pytest.mark.parametrize(("ahead_s", "side"), [(37.0, "after the last"),
@@ -257,15 +257,15 @@ def test_commands_by_another_clock(ahead_s, side):
     cell.commands = [replace(c, stamp_ns=c.stamp_ns - round(ahead_s * S)) for c in cell.commands]
     found = findings(cell.events)[None]
     assert found.startswith("25 of 25 detections were rejected as outside_every_view: all "
-                            f"detections are stamped {side} view command, about 37 s off; let")
+                            f"detections are stamped {side} view command, about 37 s off; sync")
 
 
 def test_an_encoder_that_sends_too_seldom():
     cell = scene(count=0, exposure_period_s=0.2)
     cell.samples = cell.samples[::75]
     assert findings(cell.events)[None].endswith(
-        "the encoder sends a sample every 0.15 s, and max_encoder_gap is 0.1 s; send more, or "
-        "raise max_encoder_gap")
+        "the encoder sends a sample every 0.15 s, and max_encoder_gap is 0.1 s; send them more "
+        "often, or raise max_encoder_gap")
 
 
 def test_a_view_is_named_where_the_session_as_a_whole_is_good():

@@ -47,14 +47,14 @@ def session():
     ({"angular_count": 4}, "k goes beyond 0 to 3; correct the publisher"),
     ({"grid_size": 2**31 + 1}, "is not an odd number from 3 to"),
     ({"angular_count": 2**32 - 4}, "is not a number from 3 to "),
-    ({"dx": [1000.1] * 25}, "'0': dx is no number up to 1000; give m and rad"),
-    ({"dy": [float("nan")] * 25}, "'0': dy is no number up to 1000"),
-    ({"dtheta": [float("-inf")] * 8}, "'0': dtheta is no number up to 1000"),
-    ({"u": [1e300] * 25}, "'0': u is no number up to 1000"),
+    ({"dx": [1000.1] * 25}, "'0': dx is not a number up to 1000; give m and rad"),
+    ({"dy": [float("nan")] * 25}, "'0': dy is not a number up to 1000"),
+    ({"dtheta": [float("-inf")] * 8}, "'0': dtheta is not a number up to 1000"),
+    ({"u": [1e300] * 25}, "'0': u is not a number up to 1000"),
     ({"u": [1e-200] + [2e-8] * 24}, "'0': u is below 1e-15; give m and rad"),
     ({"u_theta": [9e-16] * 8}, "'0': u_theta is below 1e-15; give m and rad"),
-    ({"sigma_theta": -1e4}, "'0': sigma_theta is no number up to 1000"),
-    ({"visit_offset_y": [float("nan")] * 25}, "'0', visits: offset_y is no number up to 1000"),
+    ({"sigma_theta": -1e4}, "'0': sigma_theta is not a number up to 1000"),
+    ({"visit_offset_y": [float("nan")] * 25}, "'0', visits: offset_y is not a number up to 1000"),
     ({"visit_count": [0] * 25}, "'0', visits: a count below 1; correct the publisher")])
 def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason):
     with pytest.raises(InputError) as caught:
@@ -88,10 +88,10 @@ def test_a_thousand_sites_for_each_mark_are_still_solved(session):
 
 
 @pytest.mark.parametrize(("view", "artifact", "reason"), [
-    (View("a", repeats=5), Artifact(1001, 0.01), "5010005 exposures are beyond the 5000000 of a"),
+    (View("a", repeats=5), Artifact(1001, 0.01), "5010005 exposures exceed the 5000000 of a"),
     (View("a", repeats=2**32 - 1), SMALL, "4294967295 repeats; ask for 1 to 1000000"),
-    (View("a", repeats=200_001), SMALL, "5000025 exposures are beyond"),
-    (View("a", grid=False, angular=False), SMALL, "neither grid nor angular marks are wanted"),
+    (View("a", repeats=200_001), SMALL, "5000025 exposures exceed"),
+    (View("a", grid=False, angular=False), SMALL, "neither grid nor angular marks are requested"),
     (View("a", translation_m=(1e17, 0.0)), SMALL, "pitches are beyond every field")])
 def test_what_the_simulated_cell_cannot_hold_is_refused(view, artifact, reason):
     command = Command(5, Phase.MEASURE, "p", 0, view, artifact, 1)

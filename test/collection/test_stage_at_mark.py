@@ -106,7 +106,7 @@ def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(wit
     assert progress[0].complete
     (line,) = [str(item) for item in collector.findings(found, progress).values()]
     assert line.startswith("600 of 625 detections were rejected as other_mark_of_one_exposure: an "
-                           "exposure shows several marks, and the plan knows of one; state in the")
+                           "exposure shows several marks, but the plan expects one; state in the")
 
 
 def test_two_marks_of_one_exposure_with_the_stage_at_neither_are_not_at_their_mark():

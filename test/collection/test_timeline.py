@@ -128,8 +128,8 @@ def test_views_planned_is_at_least_what_was_seen():
 
 def test_two_plates_in_one_plan_are_refused():
     odd = command(40, MEASURE, 1, artifact=Artifact(7, 0.01))
-    with pytest.raises(InputError, match=r"^view command of '0': describes another plate than the "
-                       r"rest of plan '0, 90, tx'; use one plate in one plan$"):
+    with pytest.raises(InputError, match=r"^view command of '0': describes a different plate from "
+                       r"the rest of plan '0, 90, tx'; use one plate in one plan$"):
         build_timeline([*WHOLE[:2], odd])
 
 

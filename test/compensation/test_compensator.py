@@ -84,7 +84,7 @@ def test_outside_is_clamped_to_the_nearest_point_of_the_edge():
 def test_outside_is_refused_on_request(call):
     compensator = Compensator(MAP, outside="refuse")
     getattr(compensator, call)(0.0, 0.0)
-    with pytest.raises(InputError, match=r"\(0\.06.*outside of the calibrated field; stay"):
+    with pytest.raises(InputError, match=r"\(0\.06.*outside the calibrated field; stay"):
         getattr(compensator, call)([0.0, 0.06], [0.0, 0.01])
 
 
@@ -214,7 +214,7 @@ def test_a_map_without_lines_says_so():
 
 @pytest.mark.parametrize("words", [{"method": "spline"}, {"outside": "extrapolate"}])
 def test_unknown_words_are_refused(words):
-    with pytest.raises(InputError, match="is unknown; take"):
+    with pytest.raises(InputError, match="is unknown; use"):
         Compensator(MAP, **words)
 
 
@@ -301,7 +301,7 @@ def test_an_angle_is_corrected_to_the_bit_as_an_array_of_one(which, theta):
 
 def test_points_outside_are_refused_on_request_and_angles_without_lines():
     refusing = Compensator(MAP, outside="refuse")
-    with pytest.raises(InputError, match="outside of the calibrated field"):
+    with pytest.raises(InputError, match="outside the calibrated field"):
         refusing.correct_point(0.06, 0.0)
     assert refusing.correct_point(0.049, 0.0) == OF_MAP["bilinear"].correct_point(0.049, 0.0)
     with pytest.raises(InputError, match="has no angular lines"):

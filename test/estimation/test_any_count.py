@@ -91,9 +91,9 @@ def test_views_off_the_lines_measure_the_grid_alone():
 
 def test_what_needs_lines_on_both_axes_is_refused():
     _, readings = measured(10)
-    with pytest.raises(InputError, match="xy_axes: of 10 lines none lies on the y axis"):
+    with pytest.raises(InputError, match="xy_axes: of 10 lines, none lies on the y axis"):
         calibrate(readings, bare(datum_theta=ThetaDatum.XY_AXES))
     with pytest.raises(InputError, match=r"Hu's law needs a square plate with 4, 8, 12"):
         calibrate(readings, Options(method="law"))
-    with pytest.raises(InputError, match="encoder xy_axes: of 10 lines none"):
+    with pytest.raises(InputError, match="encoder xy_axes: of 10 lines, none"):
         random_truth(readings.artifact, 4, np.random.default_rng(1), Spread(encoder="xy_axes"))

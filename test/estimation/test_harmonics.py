@@ -233,7 +233,7 @@ def test_an_encoder_rougher_than_its_harmonics_is_named_and_covered():
     assert len(found) == 12 and np.mean(inside) > 0.9
     cause = found[-1]
     assert (cause.unit, cause.details) == ("rad", {"harmonics": 4})
-    assert "a rotary encoder rougher than the 4 harmonics of its map follow, by" in json.dumps(
+    assert "a rotary encoder rougher than the 4 harmonics of its map can follow, by" in json.dumps(
         result_to_dict(worded(result)), ensure_ascii=False)
     enough = [calibrate(measured(plan(24, 6), seed, lines=5.0)[1], BARE) for seed in range(12)]
     assert not [cause for one in enough for cause in one.verdict.causes]

@@ -63,8 +63,8 @@ def test_what_the_bag_does_not_hold_is_named(tmp_path, topics, kind, message):
 
 
 @pytest.mark.parametrize(("field", "message"), [
-    ("", "has no distance known by itself; name its field with --laser-field"),
-    ("header", "the field 'header' is no number"), ("nothing", "has no field 'nothing'")])
+    ("", "has no known distance field; name its field with --laser-field"),
+    ("header", "the field 'header' is not a number"), ("nothing", "has no field 'nothing'")])
 def test_a_laser_type_without_a_known_field_is_named(tmp_path, field, message):
     bag = write_laser_bag(tmp_path / "b", SHORT, laser="sensor_msgs/msg/Temperature")
     with pytest.raises(InputError, match=message):
@@ -80,5 +80,5 @@ def test_a_time_of_logging_beyond_all_clocks_is_named(tmp_path):
     late = Recording(SHORT.laser_ns + (2**63 - EPOCH_NS), SHORT.laser_m, SHORT.position_ns,
                   SHORT.position_m)
     bag = write_laser_bag(tmp_path / "b", late, laser="std_msgs/msg/Float64")
-    with pytest.raises(InputError, match=r"laser: \d+ ns is no time of logging; record"):
+    with pytest.raises(InputError, match=r"laser: \d+ ns is not a log time; record"):
         read_series(bag, TOPICS)

@@ -19,9 +19,9 @@ def test_the_laser_is_doubted_beyond_2_ppm_of_the_diagonal(steps, blocks, ppm, a
     data = StepDiagonal(exact.steps_m, exact.diagonals, exact.samples_m * (1 + ppm * 1e-6),
                         exact.linear_m)
     off_um = ppm * np.hypot(*steps) * blocks
-    expected = [f"the diagonals differ from what the linear errors make of them by {off_um:.3g} "
-                "um: laser off the machine's diagonal, or linear errors of another state of the "
-                "machine"]
+    expected = [f"the diagonals differ from those calculated from the linear errors by "
+                f"{off_um:.3g} um: the laser is off the machine's diagonal, or the linear errors "
+                "are of another state of the machine"]
     found = outcome(identify_ibaraki(data), data, warnings=["before"])
     assert found["warnings"] == ["before", *(expected if advised else [])]
     assert found["closure"]["lengths"] == pytest.approx(off_um * 1e-3, abs=1e-9)

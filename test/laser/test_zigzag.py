@@ -158,8 +158,8 @@ def test_single_laser_samples_beside_their_rest_are_left_out_and_said(noise_m, s
     want = cut_zigzag(replace(series, laser_m=quiet), RULE)
     atol = 3 * noise_m / np.sqrt(len(in_rest) / 50) + 1e-14
     np.testing.assert_allclose(cut.data.readings_m, want.data.readings_m, atol=atol)
-    assert cut.notes == (f"{len(in_rest[::50])} laser sample(s) that jump out of their rest are "
-                         "left out", *want.notes)
+    assert cut.notes == (f"{len(in_rest[::50])} outlying laser sample(s) within a rest are left "
+                         "out", *want.notes)
     assert not any("jump" in note for note in want.notes)
 
 

@@ -137,7 +137,7 @@ def test_fields_of_a_command_by_name():
     ({"map_grid_size": 5, "map_grid_pitch": 0.1, "map_interpolation": "cubic"},
      "map_interpolation: 'cubic' is not known; use one of bilinear, bicubic"),
     ({"header": from_model.header(-1, "f")},
-     "selfcal/view_command: the stamp lies before 1970; set the clock")])
+     "selfcal/view_command: the stamp is before 1970; set the clock")])
 def test_commands_that_cannot_be_used(changes, message):
     values = from_model.command(Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"),
                                          Artifact(5, 0.01)), "f")

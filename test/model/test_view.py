@@ -225,15 +225,15 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
     ({"marks": 5}, "f: check_stops: the key 'offset' is missing; add it"),
     ({"marks": 5.0, "offset": 2e-5}, "f: check_stops: marks: 5.0 is not of type int"),
     ({"marks": 5, "offset": "20 um"}, "f: check_stops: offset: '20 um' is not of type float"),
-    ({"marks": 5, "offset": 0.0}, "f: view 'a' check_stops: 5 marks, 0 m off; give marks and "),
-    ({"marks": 5, "offset": -2e-5}, "f: view 'a' check_stops: 5 marks, -2e-05 m off; give marks"),
-    ({"marks": -1, "offset": 2e-5}, "f: view 'a' check_stops: -1 marks, 2e-05 m off; give marks"),
-    ({"marks": 0, "offset": 2e-5}, "f: view 'a' check_stops: 0 marks, 2e-05 m off; give marks"),
-    ({"marks": 5, "offset": math.nan}, "f: view 'a' check_stops: 5 marks, nan m off; give marks"),
+    ({"marks": 5, "offset": 0.0}, "f: view 'a' check_stops: 5 marks, 0 m off; give both "),
+    ({"marks": 5, "offset": -2e-5}, "f: view 'a' check_stops: 5 marks, -2e-05 m off; give both"),
+    ({"marks": -1, "offset": 2e-5}, "f: view 'a' check_stops: -1 marks, 2e-05 m off; give both"),
+    ({"marks": 0, "offset": 2e-5}, "f: view 'a' check_stops: 0 marks, 2e-05 m off; give both"),
+    ({"marks": 5, "offset": math.nan}, "f: view 'a' check_stops: 5 marks, nan m off; give both"),
     ({"marks": 5, "offset": 0.00251}, "f: view 'a' check_stops: 0.00251 m is more than a quarter "
      "of the pitch; stop at most 0.0025 m off the mark; 20e-6 is usual"),
-    ({"marks": 12, "offset": 2e-5}, "f: view 'a' check_stops: 12 marks are wanted, 11 lie in the "
-     "field; ask for fewer marks")])
+    ({"marks": 12, "offset": 2e-5}, "f: view 'a' check_stops: 12 marks are requested, 11 lie in "
+     "the field; ask for fewer marks")])
 def test_check_stops_that_are_refused(stops, message):
     with pytest.raises(InputError) as caught:
         plan_from_dict(plan_with({"translation_pitch": [10, 0]}, check_stops=stops), "f")

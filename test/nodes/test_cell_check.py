@@ -142,13 +142,13 @@ def test_a_plate_with_a_list_of_marks_is_checked_by_the_innermost(graph):
 def test_a_cell_without_ids_passes_and_that_is_said(graph):
     _, items = checked(graph, with_ids=False)
     assert failed(items) == set(), items
-    assert items["ids"].figure.endswith("name their mark: marks are told by where they lie")
+    assert items["ids"].figure.endswith("name their mark: marks are identified by their positions")
 
 
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("cell", "figure", "remedy"), [
-    ({"microscope_axes": "-x-y"}, "offsets of the other sign", "turn the sign"),
-    ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "turn the sign"),
+    ({"microscope_axes": "-x-y"}, "offsets of the other sign", "reverse the sign"),
+    ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "reverse the sign"),
     ({"microscope_axes": "yx"}, "exchanged axes", "along the stage's axes"),
     ({"microscope_pixels": 2.0}, "offsets in wrong units", "correct the pixel size"),
     ({"microscope_pixels": 0.5}, "offsets in wrong units", "correct the pixel size")],
@@ -165,8 +165,8 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
 @pytest.mark.parametrize(("fault", "name", "figure"), [
     ("deaf", "commands", "0 detections in 5 s after MEASURE"),
     ("goes on after ABORT", "abort", "detections later than"),
-    ("acts again", "old commands", "detections after a MEASURE that was over"),
-    ("never revisits", "revisits", "not seen again in 3 s"),
+    ("acts again", "old commands", "detections after a finished MEASURE was sent again"),
+    ("never revisits", "revisits", "not measured again within 3 s"),
     ("no check stops", "check stops", "0 of 5 marks from all four sides"),
     ("loses", "marks", "of 9 marks"),
     ("detections ahead", "detection clock", "stamps -2"),

@@ -252,7 +252,8 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
         graph.until(lambda number=number: node.session.collector.received["command"] == 2 + number,
                     "the command")
     graph.until(lambda: diagnostics[-1].status[0].message == (
-        "the encoder is not heard; view '0': 0 % of the readings taken"), "a view that is whole")
+        "no encoder samples are received; view '0': 0 % of the readings taken"),
+        "a view that is whole")
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -267,7 +268,7 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
         plan = plan_of("0", size, count=8)
         commands.publish(fill(names.COMMAND.type(), from_model.command(Command(
             second * 10**9, Phase.MEASURE, "one", 0, plan.views[0], plan.artifact, 1), "stage")))
-    line = "describes another plate than the rest of plan 'one'"
+    line = "describes a different plate from the rest of plan 'one'"
     received = node.session.collector.received
     for expected in (3, 6, 9):  # each makes the collector look again
         graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN

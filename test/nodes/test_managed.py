@@ -141,8 +141,8 @@ def test_a_transition_that_does_not_exist_is_refused_and_ends_nothing(graph):
     assert state(graph, "solver") == "active"
     assert change(graph, "solver", Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph, "solver") == "finalized"
-    assert node.diagnosis() == Diagnosis(Level.ERROR, "finalized: shut down by a request, for "
-                                         "good; end this process and start the node again")
+    assert node.diagnosis() == Diagnosis(Level.ERROR, "finalized: shut down on request; end "
+                                         "this process and start the node again")
 
 
 def test_an_inactive_node_says_so(graph):
@@ -207,8 +207,9 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
     heard: list = []
     topic = names.of_node("measurement_collector", names.HEALTH)
     graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
-    graph.until(lambda: any("stage/mark_detections: nothing is heard of /hand (" in s.message
-                            and s.level == DiagnosticStatus.ERROR for s in heard), "its name")
+    graph.until(lambda: any("stage/mark_detections: no messages are received from /hand ("
+                            in s.message and s.level == DiagnosticStatus.ERROR for s in heard),
+                "its name")
     assert node.get_name() == "measurement_collector"
 
 
@@ -219,7 +220,7 @@ def test_two_solvers_are_named(graph):
     heard: list = []
     topic = names.of_node("solver", names.HEALTH)
     graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
-    line = "selfcal/error_map has 2 publishers: /hand, /solver; one is right"
+    line = "selfcal/error_map has 2 publishers: /hand, /solver; only one is allowed"
     graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
                             for s in heard), line)
     assert first.get_name() == "solver"

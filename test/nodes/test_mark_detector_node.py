@@ -62,7 +62,7 @@ def test_the_node_finds_what_the_command_finds_bit_for_bit(graph, bag, tmp_path,
     assert heard == expected
     refused = node.refusals.diagnosis()
     assert refused.level == Level.WARN
-    assert "160 x 100 pixels, but the images before have 160 x 120" in refused.message
+    assert "160 x 100 pixels, but earlier images have 160 x 120" in refused.message
 
 
 def _taken(node) -> int:

@@ -176,7 +176,7 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
     assert lines == [(Level.ERROR, (
         "bag_player: /measurement_collector does not listen to stage/joint_states, "
         "stage/mark_detections, selfcal/view_command after 0.2 s, nothing was played; start it, "
-        "name another node as listener, or set listener to '' to wait for nobody"))]
+        "name another node as listener, or set listener to '' to play without waiting"))]
 
 
 @pytest.mark.parametrize("parameters", [{"listener": ""}, {"wait_for_subscribers": 0.0}])
@@ -229,7 +229,7 @@ def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(gra
     assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 1)
     total = player.player.total
     assert lines == [(Level.ERROR, f"{bag}: {total} messages when it was opened, 1 now; play a bag "
-                                   "that nobody changes")]
+                                   "that is not being changed")]
 
 
 def test_what_was_flushed_survives_a_crash(graph, tmp_path):

@@ -175,8 +175,8 @@ def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
     answer = desk.ask("start")
     assert answer.success
     assert answer.message == (
-        "waiting for measurement_collector (no sign of life), solver (no sign of life); starts by "
-        "itself when they are there")
+        "waiting for measurement_collector (no sign of life), solver (no sign of life); starts "
+        "automatically when they are present")
     heard: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
     for said, values in (
@@ -217,7 +217,7 @@ def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
             "view_name": PLAN.views[1].name, "command_stamp": "1700"}
     all_alive(graph, **told)
     graph.until(lambda: not desk.node.session.missing(), "all of them")
-    assert desk.ask("start").message == f"took up run 17 in view '{PLAN.views[1].name}', MEASURE"
+    assert desk.ask("start").message == f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE"
     desk.expect((MEASURE, 1))
     assert to_model.command(desk.heard[0]) == Command(
         1700, MEASURE, PLAN.plan_id, 1, PLAN.views[1], PLAN.artifact, len(PLAN.views), "17")
@@ -380,7 +380,7 @@ def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     status, result = actor.result(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert (result.error_code, result.map_path) == (4, "")
-    assert result.message == ("run_calibration: the solver has not saved the map in 0.1 s; look at "
+    assert result.message == ("run_calibration: the solver has not saved the map in 0.1 s; check "
                               "the solver, then call save_map")
 
 

@@ -106,7 +106,7 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
             up.until("pose_sequencer ended with signal 9: restarted")
             up.until("now: Press s to start the plan.")
             up.write("start")
-            assert f"in view '{view.name}', PLACE" in up.until("took up run ")
+            assert f"in view '{view.name}', PLACE" in up.until("resumed run ")
         if index == 2:
             os.kill(pid_of(up.process.pid, "solver"), signal.SIGKILL)
             up.until("solver ended with signal 9: restarted")
@@ -169,7 +169,7 @@ def test_a_killed_command_takes_its_nodes_along(start, tmp_path):
     """Of a kill it knows nothing: each node, and the screen's eyes, end by themselves."""
     up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",
                str(tmp_path / "journals"), before=ONE_NODE)
-    up.until("pose_sequencer is not there")
+    up.until("pose_sequencer is not running")
     wait_until(lambda: len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1,
                "the collector's journal")
     up.process.send_signal(signal.SIGKILL)
@@ -184,7 +184,7 @@ def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
         stdin=terminal, stdout=terminal, stderr=subprocess.PIPE, text=True, start_new_session=True)
     os.close(terminal)
     drawn = b""
-    while b"pose_sequencer is not there" not in drawn:
+    while b"pose_sequencer is not running" not in drawn:
         drawn += os.read(keyboard, 4096)
     os.close(keyboard)
     _, said = process.communicate(timeout=PATIENCE_S)

@@ -75,7 +75,7 @@ def test_figures_follow_what_the_result_keeps():
     bare, rich = (parsed(html_of(r)).text for r in (known_result(5, 24)[0], with_residuals()))
     titles = ("Residuals of the grid readings by view", "Distribution of the grid residuals",
               "Distribution of the angular residuals", "Mean residuals over the time",
-              "Rejected grid readings, where they happened")
+              "Positions of rejected grid readings")
     for title in titles:
         assert not any(title in text for text in bare)
         assert any(title in text for text in rich)

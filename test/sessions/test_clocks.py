@@ -7,7 +7,7 @@ import pytest
 from selfcal_ros.sessions.clocks import ClockWatch, RosTime
 from selfcal_ros.sessions.health import Level
 
-NOTHING = ("use_sim_time is set and nothing is heard on /clock: what this node stamps is stamped "
+NOTHING = ("use_sim_time is set but nothing is received on /clock: this node stamps everything "
            "0; play the bag with --clock, or start the node without use_sim_time")
 
 
@@ -80,4 +80,4 @@ def test_a_clock_that_moves_and_stands_is_told_at_each_change():
     assert [item.level for item in found] == [Level.WARN] + [Level.OK] * 5
     moves = (Level.OK, "stamps follow /clock (use_sim_time); work and health do not")
     assert said == [(Level.WARN, NOTHING), moves, (
-        Level.OK, "/clock stands at 8.500 s; work and health go on, stamps do not"), moves]
+        Level.OK, "/clock has stopped at 8.500 s; work and health continue, stamps do not"), moves]

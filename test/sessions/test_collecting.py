@@ -59,7 +59,7 @@ def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
     assert said.startswith("12 of 12 detections were rejected as stage_not_at_mark: the plate lies "
                            "turned by 180°, not by 0° (or its ids are those of other marks); turn "
                            "it as planned")
-    assert "the stage is indicated at minus the marks' sites; the sense is the other one" in said
+    assert "the stage is indicated at minus the marks' sites; the sense is reversed" in said
     cell.feed(e for e in events.events if e.stamp_ns >= half)
     assert len(cell.said) == 1
 
@@ -128,7 +128,7 @@ def test_a_view_that_began_before_the_node_is_missed_until_it_is_measured_again(
     assert list(cell.session.missed.values()) == missed
     late = heard[-1][2] or (Phase.MEASURE, True) in [item[1:] for item in heard]
     assert [line for _, line in cell.said] == ([
-        "view '0' began before this node: what was detected until now is missing here; "
+        "view '0' began before this node: earlier detections are missing here; "
         "redo_view measures it again"] if late else [])
     state = cell.session.diagnosis(detections_matched=True).message
     assert state.endswith("began before this node: 0") == bool(missed)
@@ -163,7 +163,7 @@ def test_a_run_with_two_plates_is_an_error_until_the_next_run():
     assert (level, line.partition("use one")[2]) == (
         Level.ERROR, " plate in one plan; then start a new run")
     told = cell.session.diagnosis(detections_matched=True)
-    assert told.level == Level.WARN and "describes another plate" in told.message
+    assert told.level == Level.WARN and "describes a different plate" in told.message
     later = events.commands[-1].stamp_ns + 10**9
     cell.feed([replace(first, stamp_ns=later, run_id=str(later), phase=Phase.MEASURE,
                        artifact=replace(first.artifact, grid_size=7))])

@@ -488,7 +488,7 @@ def test_a_sigma_that_cannot_be_costs_that_detection_and_is_a_warning():
     assert status["missing_m"] == [events[index].m] and status["missing_n"] == [events[index].n]
     told = desk.told()
     assert told.level == Level.WARN
-    assert "1 detection rejected as sigma_out_of_range: their sigma is no " in told.message
+    assert "1 detection rejected as sigma_out_of_range: their sigma is not a " in told.message
     assert told.values["rejected sigma_out_of_range"] == 1
 
 

@@ -164,7 +164,7 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
 @pytest.mark.parametrize("the_map, the_summary, why", [
     ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
     ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
-    ({}, {"views_done": 3}, "plan demo, run 7 is of 3 of 4 views"),
+    ({}, {"views_done": 3}, "plan demo, run 7 contains 3 of 4 views"),
     ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
     ({}, {"stamp_ns": START_NS + 1},
      "no selfcal/summary says yet whether plan demo, run 7 is complete")])

@@ -67,7 +67,7 @@ def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values,
 
 def test_a_refused_image_is_counted(desk):
     desk.session.take(image(3, drawn()))
-    with pytest.raises(InputError, match="stamp is that of an image before"):
+    with pytest.raises(InputError, match="stamp is that of an earlier image"):
         desk.session.take(image(3, drawn()))
     assert desk.session.diagnosis().values["images_refused"] == 1
     assert len(desk.sent) == 1

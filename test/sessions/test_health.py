@@ -89,7 +89,7 @@ def test_what_was_published_while_nobody_listened_is_told_apart(hands):
     losses.add_unheard("topic", 4)
     assert losses.diagnosis().values == {"lost topic": 2, "lost topic, not listening": 11}
     assert hands.lines(Level.WARN)[1:] == [
-        "topic: 7 messages were published while this node did not listen"]
+        "topic: 7 messages were published while this node was not listening"]
 
 
 @pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])

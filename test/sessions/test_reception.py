@@ -184,7 +184,7 @@ def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
     assert second.read() == expected
     assert not second.session.missed
     assert second.session.diagnosis(detections_matched=True).values["phase"] == "DONE"
-    [line] = [line for line in second.hands.lines(Level.OK) if line.startswith("took up")]
+    [line] = [line for line in second.hands.lines(Level.OK) if line.startswith("resumed")]
     assert f"with {cut} messages" in line
 
 
@@ -227,8 +227,8 @@ def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, l
     second.reception.drain()
     assert (sum(second.session.collector.received.values()) > 0) == goes_on
     assert second.hands.lines(Level.WARN) == ([] if goes_on else [
-        f"{first_path(tmp_path)}: its run was left {hours} h ago and is not taken up; 'selfcal "
-        "solve' reads it, a greater journal_max_age goes on with it"])
+        f"{first_path(tmp_path)}: its run was left {hours} h ago and is not resumed; 'selfcal "
+        "solve' reads it, a larger journal_max_age resumes it"])
     assert (second.keeper.path == first_path(tmp_path)) == goes_on
 
 
@@ -362,15 +362,15 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected
     told = desk.reception.diagnosis()
     assert (told.level, told.values["journal_lost"]) == (Level.WARN, 30)
     assert told.message == (f"{desk.keeper.path}: the journal cannot be written (No space left on "
-                            "device); make room or name another folder; 30 messages are not in "
-                            "the journal")
+                            "device); free some space or name another folder; 30 messages are not "
+                            "in the journal")
     disk.full = False
     desk.hands.pass_time(10)
     desk.receive(events[70:])
     assert desk.read() == expected
     assert desk.hands.lines(Level.WARN) == [
-        f"{desk.keeper.path}: the journal cannot be written (No space left on device); make room "
-        "or name another folder; collecting goes on without",
+        f"{desk.keeper.path}: the journal cannot be written (No space left on device); free some "
+        "space or name another folder; collecting continues without it",
         f"{desk.keeper.path}: the journal is written again; 30 messages are not in it"]
     told = desk.reception.diagnosis()
     assert (told.level, told.message) == (Level.WARN, "30 messages are not in the journal")
@@ -487,7 +487,7 @@ def test_a_journal_is_taken_up_on_a_full_disk_and_gone_on_with_when_there_is_roo
     second.receive(events[200:260]).reception.drain()
     assert sum(second.session.collector.received.values()) == 260
     [line] = second.hands.lines(Level.OK)
-    assert line.startswith(f"took up {first_path(tmp_path)} with 200 messages, in view")
+    assert line.startswith(f"resumed {first_path(tmp_path)} with 200 messages, in view")
     disk.full = False
     second.hands.pass_time(10)
     second.reception.drain()
@@ -514,10 +514,10 @@ def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, mo
         second = Desk(tmp_path)
         second.receive(events[50:60]).reception.drain()
     assert second.hands.lines(Level.WARN) == [
-        f"{tmp_path}: the journal cannot be written (Input/output error); make room or name "
-        "another folder; collecting goes on without",
+        f"{tmp_path}: the journal cannot be written (Input/output error); free some space or "
+        "name another folder; collecting continues without it",
         f"{tmp_path}: the journal cannot be read (Input/output error); correct that, then restart "
-        "the collector; the run is not taken up"]
+        "the collector; the run is not resumed"]
     second.hands.pass_time(10)
     second.reception.drain()
     second.receive(events[60:70]).reception.drain()
@@ -593,7 +593,7 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
     assert told.level == Level.WARN
     assert {line.partition(": ")[0] for line in desk.refused} == set(INPUT_TOPICS)
     assert all(re.search(r"stamped 864\d\d s ahead of this node's clock: not used; set the clock "
-                         "that stamps it; what is stamped right counts$", line)
+                         "that stamps it; correctly stamped messages are used$", line)
                for line in desk.refused)
     desk.receive(honest).reception.drain()
     measurements, _ = desk.session.collector.collect()
@@ -663,8 +663,8 @@ def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
     first.session.tick()
     told = first.session.diagnosis(detections_matched=True)
     line = ("the newest view command is stamped 86399 s ahead of this machine's clock, which was "
-            "set back: no later run is shown; restart measurement_collector, which leaves such a "
-            "run aside, and start the plan again")
+            "set back: no later run is shown; restart measurement_collector, which ignores such "
+            "a run, and start the plan again")
     assert told.level == Level.WARN and line in told.message
     assert first.hands.lines(Level.WARN).count(line) == 1
     first.keeper.close()
@@ -714,4 +714,5 @@ def test_a_forged_command_within_a_run_changes_nothing_and_is_a_warning(events):
     assert measurements.all_rejected() == {}
     told = desk.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN
-    assert "1 view command of plan 'forged' came within a run that goes on" in told.message
+    assert ("1 view command of plan 'forged' arrived during a run, belonging to no run"
+            in told.message)

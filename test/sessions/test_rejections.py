@@ -23,7 +23,7 @@ from selfcal_ros.sessions.rejections import PATIENCE_S
 from test.support.collecting import detection_table, encoder_block, scene
 from test.support.ports import Hands, message, settings_of
 
-CLOCK = "let both be stamped by one clock"
+CLOCK = "stamp both by one clock"
 STEP_S = 0.5
 
 
@@ -185,5 +185,5 @@ def test_lines_without_their_joint_are_told_although_the_marks_are_more():
     [line] = cell.hands.lines(Level.WARN)
     assert line == (
         "view '0': none of the last ones was used: 7 of 7 detections were rejected as no_encoder_"
-        "sample_near: no encoder sample of the joint 'theta' came; names that came: 'x', 'y'; set "
-        "joint_x, joint_y, joint_theta")
+        "sample_near: no encoder sample of the joint 'theta' arrived; joints received: 'x', 'y'; "
+        "set joint_x, joint_y, joint_theta")

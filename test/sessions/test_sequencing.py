@@ -240,7 +240,7 @@ def test_only_a_sequencer_that_has_done_nothing_yet_takes_up_a_run(tmp_path):
     assert desk.commands == [(MEASURE, 1), (ABORT, 1), (PLACE, 0)]
 
 
-@pytest.mark.parametrize("short, known", [(0, "; measured already: 0"), (1, "")])
+@pytest.mark.parametrize("short, known", [(0, "; already measured: 0"), (1, "")])
 def test_a_view_that_was_aborted_is_not_measured_already(tmp_path, short, known):
     desk = Desk(tmp_path, start_checks=True)
     count = np.full(25, 2)
@@ -252,7 +252,7 @@ def test_a_view_that_was_aborted_is_not_measured_already(tmp_path, short, known)
     desk.hear("measurement_collector", **TOLD)
     desk.hear("solver")
     assert desk.session.begin() == (
-        f"took up run 17 in view '{PLAN.views[1].name}', MEASURE{known}")
+        f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE{known}")
 
 
 @pytest.mark.parametrize("seconds, said", [(4.99, False), (5.0, True)])
@@ -283,7 +283,7 @@ def test_a_view_without_any_detection_stalls_too_and_the_collector_is_quoted(mea
     measuring.session.presence.take("measurement_collector", Diagnosis(Level.WARN, "clock"))
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [
-        "view '0' stalls: no detection has come since MEASURE; measurement_collector: clock"]
+        "view '0' stalls: no detection has arrived since MEASURE; measurement_collector: clock"]
 
 
 def test_a_stall_ends_with_the_next_detection_and_a_slow_cell_gets_more_time(measuring):
@@ -322,7 +322,7 @@ def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
     measuring.hands.pass_time(seconds)
     for _ in range(2):
         measuring.session.tick()
-    line = "no sign of life of solver for 3 s: it hangs or has ended"
+    line = "no sign of life from solver for 3 s: it hangs or has ended"
     assert [text.startswith(line) for text in measuring.hands.lines(Level.WARN)] == [True] * said
     assert measuring.session.diagnosis().message.startswith(line) is bool(said)
     measuring.hear("solver")

@@ -175,7 +175,7 @@ def test_the_later_run_supersedes(new, current, later):
 def test_readings_that_name_no_beginning_take_nothing_from_a_run_that_does(desk, run_id):
     views = views_of(run_id="100")
     desk.take(views[:2])
-    with pytest.raises(InputError, match="a run that does not say when it began, while run 100"):
+    with pytest.raises(InputError, match="readings without a run_id, while run 100"):
         desk.take(views_of(seed=6, run_id=run_id)[:1])
     desk.take(views[2:])
     last = desk.hands.of("map")[-1]
@@ -430,7 +430,7 @@ def test_a_map_is_saved_into_a_file_or_a_new_one_alone(tmp_path):
     (tmp_path / "old.json").touch()
     for path, problem in (("pipe", "^pipe: is not a regular file; name another file$"),
                           ("folder", "is not a regular file"), ("", "is empty"),
-                          ("a\0b", "is no file name"), ("../x", "lies outside")):
+                          ("a\0b", "is not a file name"), ("../x", "lies outside")):
         with pytest.raises(InputError, match=problem):
             result_file(path, str(tmp_path))
     for path in ("old.json", "new.json"):
@@ -514,7 +514,7 @@ def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
     line, _ = desk.session.save("map.json")
     assert line.endswith(
         f"; WARNING: the newer run {NOW + 7} of plan '{PLAN.plan_id}' is not in this map: none of "
-        "its readings has come; the health of measurement_collector says why")
+        "its readings has arrived; the health of measurement_collector says why")
     assert desk.session.diagnosis().level == Level.OK  # it may be measured just now
     desk.session.take_command(command(4, run_id=str(NOW + 7), phase=Phase.DONE))
     told = desk.session.diagnosis()

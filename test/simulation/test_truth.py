@@ -137,7 +137,7 @@ def test_plates_without_lines_have_three_views_of_hu():
 
 
 def test_axes_between_the_lines_are_refused():
-    with pytest.raises(InputError, match="of 6 lines none lies on the y axis; use independent"):
+    with pytest.raises(InputError, match="of 6 lines, none lies on the y axis; use independent"):
         truth_of(Artifact(5, 0.01, 6))
 
 

@@ -292,5 +292,5 @@ def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monk
     monkeypatch.setattr(verb, "collect_bag", lambda *_: (readings, {}, [], []))
     assert main(["iso230", "some_bag", "--result", str(tmp_path / "r.json")]) in (0, 5)
     both = capsys.readouterr()
-    assert "visit_order" in both.err and "M alone is given" in both.err
+    assert "visit_order" in both.err and "only M is given" in both.err
     assert "without repeats" in both.out

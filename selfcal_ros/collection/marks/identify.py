@@ -297,7 +297,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     base, between = int(whole), part * step  # a turn between two lines only for a Fourier map
     reading_rad = wrap(reading_rad - between) if between else reading_rad
     known = has_id & (ids >= 0) & (ids < count)
-    told = phi_rad is not None or known.any()
+    rotation_known = phi_rad is not None or known.any()
     if phi_rad is None:
         named = wrap(reading_rad - (ids + base) * step)[known]
         phi_rad = _middle(named, 2 * np.pi) if len(named) else _middle(reading_rad, step)
@@ -309,7 +309,7 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     turned = abs(phi_rad) > max(rigids.LARGEST_TURN_RAD, step / 2)
     reasons[(away > step / 4) | turned] = Reason.TOO_FAR
     reasons[~has_id & (away > rules.ambiguity_ratio * (step - away))] = Reason.AMBIGUOUS
-    if not told and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
+    if not rotation_known and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
         reasons[~has_id] = Reason.ROTATION
     reasons[has_id & ~known] = Reason.UNKNOWN_MARK
     return MarkAssignment(line, deviation, residual, reasons, rigids.Rigid(phi_rad))

@@ -93,8 +93,8 @@ class SeenPose:
     def text(self, others: str) -> str:
         """Return what is wrong, and the remedy, in one line; `others`: what other views show."""
         if self.mirrored:
-            return (f"{self.mirror}, or the plate lies upside down; correct the ids, or lay the "
-                    f"plate as planned and measure this view again{others}")
+            return (f"{self.mirror}, or the plate lies upside down; correct the ids, or place "
+                    f"the plate as planned and measure this view again{others}")
         error = said(self.pose)
         return f"{error.what} (or its ids are those of other marks); {error.remedy}{others}"
 
@@ -112,7 +112,7 @@ def seen_poses(views: Mapping[int, NamedMarks], limit: float,
     max_rotation_rad : float
         Largest rotation of a plate that lies as planned.
     """
-    found = ((index, _seen(view, limit, max_rotation_rad)) for index, view in views.items())
+    found = ((index, _found_pose(view, limit, max_rotation_rad)) for index, view in views.items())
     return {index: seen for index, seen in found if seen is not None}
 
 
@@ -150,7 +150,7 @@ def _lies_as(one: SeenPose, other: SeenPose) -> bool:
         np.hypot(*np.subtract(a.found_shift, b.planned_shift)) < NEAR)
 
 
-def _seen(view: NamedMarks, limit: float, max_rotation_rad: float) -> SeenPose | None:
+def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> SeenPose | None:
     """Return how the marks of a view are seen; None if they do not show it."""
     if not view.spread:
         return None

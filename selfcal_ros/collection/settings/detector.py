@@ -27,7 +27,7 @@ class DetectorSettings(ManagedSettings):
     mark_width: float = declared(
         0.0, "width of the line of a ring or cross; 0 = a fifth of mark_size", "m", 0.0, 1000.0)
     polarity: str = declared(
-        "dark", "marks on their ground; corners are both", choices=("dark", "bright"))
+        "dark", "marks against the background; corners are both", choices=("dark", "bright"))
     turn: float = declared(
         0.0, "angle by which the camera's image is turned to lie along the stage axes, "
         "counter-clockwise", "deg", -360.0, 360.0)

@@ -89,7 +89,7 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
             try:
                 values.append(int(cell) if name == "id" else float(cell))
             except ValueError:
-                raise InputError(place, f"{name} '{cell}' is no {_KIND[name]}",
+                raise InputError(place, f"{name} '{cell}' is not a {_KIND[name]}",
                                  "correct the line") from None
     marks_of(columns["id"], columns["x"], columns["y"], where=[place for place, _ in lines[1:]])
     return columns

@@ -139,8 +139,8 @@ class SolverSettings(ManagedSettings):
         "", "kind marks: marks, distance, its u (m), M,N:M,N:LENGTH:U; of a list ID:ID:LENGTH:U")
     reference_certificate: str = declared("", "certificate of the known length: number, issuer")
     reference_at: str = declared(
-        "", "temperatures that move that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], e.g. "
-        "20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = measured where it is used")
+        "", "temperatures for converting that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], "
+        "e.g. 20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = measured where it is used")
     model_terms: list[str] = declared(
         [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
         f"size is a standard deviation, SI; 0 = exactly zero; empty = those of the plan; "
@@ -158,8 +158,8 @@ class SolverSettings(ManagedSettings):
                                           "above which there is a warning", "m/m", 0.0, 1.0)
     drift_degree: int = declared(DRIFT_DEGREE, "degree of the polynomial of time for the drift of "
                                  "a view, if drift is a term", "", 1, MAX_DRIFT_DEGREE)
-    prior: str = declared("none", "prior of the stage's map: gp = its error is smooth, of a size "
-                          "and correlation length that the readings show", choices=("none", "gp"))
+    prior: str = declared("none", "prior for the stage's map: gp = a smooth error, size and "
+                          "correlation length from the readings", choices=("none", "gp"))
     save_path: str = declared("", "RESULT.json to write whenever the map changes; {run_id} in it "
                               "is replaced by the run; empty = none")
     result_folder: str = declared(

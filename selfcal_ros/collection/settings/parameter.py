@@ -43,7 +43,7 @@ class Parameter:
             raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
                              "put it in quotes" if kind is str else "correct the value")
         if kind is list and not all(isinstance(item, str) for item in value):
-            raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of texts",
+            raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of strings",
                              "put each item in quotes")
         if self.choices and value not in self.choices:
             raise InputError(f"{where}: {self.name}", f"{value!r} is not known",
@@ -114,5 +114,5 @@ class Settings:
 class ManagedSettings(Settings):
     """The parameters of a managed node."""
 
-    autostart: bool = declared(True, "configure and activate by itself; false = wait for a "
+    autostart: bool = declared(True, "configure and activate automatically; false = wait for a "
                                "lifecycle manager")

@@ -286,7 +286,7 @@ def worded(fault: WiringFault) -> WiringError:
     """Return the error for a fault: in one line, what is wrong and how to correct it."""
     responses = fault.responses
     names = " and ".join(f"offset_{response.offset}" for response in responses)
-    told = ", ".join(
+    numbers = ", ".join(
         f"offset_{r.offset} against {r.axis}: {r.slope:+.2f} ± {r.u_slope:.2g}, expected "
         f"{0 if r.crossed else -1}" for r in responses)
     if any(response.crossed for response in responses):
@@ -297,11 +297,11 @@ def worded(fault: WiringFault) -> WiringError:
     elif any(response.slope > 0 for response in responses):
         what = "offsets of the other sign: " + names + (
             " rise" if len(responses) > 1 else " rises") + " where the optical axis moves on"
-        remedy = f"publish mark - optical axis: turn the sign of {names}"
+        remedy = f"publish mark - optical axis: reverse the sign of {names}"
     else:
         what = f"offsets in wrong units: {names} " + ", ".join(
             f"{abs(r.slope):.3g}" for r in responses) + " times what the stage moves"
         remedy = "correct the pixel size, or the unit: offsets are in " + (
             "rad" if fault.kind == "angular" else "m")
     where = "stage/mark_detections" + (f" of view '{fault.view}'" if fault.view else "")
-    return WiringError(where, f"{what} (slope among repeats of {told})", remedy)
+    return WiringError(where, f"{what} (slope among repeats of {numbers})", remedy)

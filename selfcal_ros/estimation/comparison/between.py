@@ -16,7 +16,7 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.error_map import MANY_DOF
 
 INDEPENDENT = 1e-6
-"""Length of a unit shape outside of those before it, below which it is not one of its own."""
+"""Part of a unit shape outside the span of earlier ones, below which it adds nothing."""
 RUNS_LEVEL = 0.05
 """Probability that a run stands out, or a part between runs seems to exist, by chance."""
 SINGLE = 0.8

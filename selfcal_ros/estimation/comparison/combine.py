@@ -65,7 +65,7 @@ MAX_STORED = 2 * 21 * 21
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """The mean map as a result, and what was found on the way.
+    """The mean map as a result, with the intermediate findings.
 
     `xy` and `theta` have the mean and the deviations of the coordinates of the sites `known`
     (Gx, then Gy) and of the angular lines; `theta` is None without angular maps in all runs.

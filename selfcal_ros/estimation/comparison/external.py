@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of other origin: a table of errors with their uncertainties, as `selfcal table` writes."""
+"""A map from another source: a table of errors and uncertainties, as `selfcal table` writes."""
 
 from typing import NamedTuple
 
@@ -52,7 +52,7 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
         for name, values in (grid if is_site else circle).items():
             values[at] = row.cells[name]
             if name.startswith("u_") and (values[at] <= 0 or values[at] > 1):
-                raise InputError(row.place, f"{name} {values[at]:g} is no standard uncertainty",
+                raise InputError(row.place, f"{name} {values[at]:g} is not a standard uncertainty",
                                  "give it in m (rad), k = 1")
     known = np.isfinite(list(grid.values())).all(axis=0)
     if not known.any():

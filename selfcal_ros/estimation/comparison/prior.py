@@ -127,7 +127,7 @@ class Field:
         return cho_factor(noise**2 * own + np.kron(np.eye(2), field), lower=True)
 
     def stands_off(self, size: float, length: float, noise: float) -> tuple[int, float]:
-        """Return the node that is farthest off what the others say of it, and the p value of that.
+        """Return the node that deviates most from its prediction by the others, and its p value.
 
         By its Mahalanobis square about the field of the other nodes; p is of that one node.
         """
@@ -143,17 +143,17 @@ class Field:
         return int(at[worst]), float(fdtrc(2, min(self.dof, SURE_DOF), squares[worst] / 2))
 
     def conditioned(self, size: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the prior makes of the values, (2n, 2n), and their covariance (eq. 15.3)."""
+        """Return the matrix that applies the prior, (2n, 2n), and the covariance (eq. 15.3)."""
         own = size**2 * (self.correlation(length) + JITTER * np.eye(self.beyond.shape[1]))
         precision = np.kron(np.eye(2), self.beyond @ np.linalg.solve(own, self.beyond.T))
         free = null_space(self.modes.T)
-        told = np.linalg.inv(free.T @ self.covariance @ free)
-        after = free @ np.linalg.inv(told + free.T @ precision @ free)
-        return after @ told @ free.T, after @ free.T
+        information = np.linalg.inv(free.T @ self.covariance @ free)
+        after = free @ np.linalg.inv(information + free.T @ precision @ free)
+        return after @ information @ free.T, after @ free.T
 
 
 def estimated(field: Field) -> tuple[Field, float, float]:
-    """Return the field without the nodes that stand off it, its size, m, and length, pitches.
+    """Return the field without the nodes that deviate from it, its size, m, and length, pitches.
 
     Raises
     ------
@@ -176,13 +176,13 @@ def estimated(field: Field) -> tuple[Field, float, float]:
     alone = np.sqrt((field.misfit(0.0, 1.0)[1] + dof) / (n + dof))  # the likeliest without a field
     if field.misfit(0.0, 1.0, float(alone))[0] - best < chdtri(2, LEVEL):
         raise InputError("prior", "the readings show no error of the stage beyond first order to "
-                         "learn it from", REMEDY)
+                         "estimate it from", REMEDY)
     if length < SHORTEST:
         raise InputError("prior", f"the stage's error is correlated over {length:.3g} pitches, "
                          f"less than {SHORTEST:g}", REMEDY)
     p = float(fdtrc(n, dof, field.misfit(size, length)[1] / n))
     if p < LEVEL or best - at(_least(at, np.append(found, 0.0))) > chdtri(1, 2 * LEVEL):
-        raise InputError("prior", "the readings contradict a stage that is a smooth field of one "
+        raise InputError("prior", "the readings contradict a smooth stage error with one "
                          "correlation length: part of its error is rougher", REMEDY)
     return field, size, length
 
@@ -211,7 +211,7 @@ def _likeliest(field: Field, start: np.ndarray | None = None) -> tuple[Misfit, n
 
 
 def _least(of: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarray:
-    """Return the place of the least value near a start."""
+    """Return the position of the minimum near a start."""
     from scipy.optimize import minimize  # for this alone
 
     steps = np.vstack([np.zeros(len(start)), 0.5 * np.eye(len(start))])
@@ -254,9 +254,9 @@ def with_prior(result: CalibrationResult, covariance: Covariance) -> Calibration
     now = replace(emap, gx=g[0], gy=g[1], u_gx=u[0], u_gy=u[1], nonorthogonality=o,
                   scale_difference=r)
     result = replace(result, extra={**result.extra, PRIOR: facts})
-    told = np.diag(gain @ field.covariance @ gain.T)
+    variances = np.diag(gain @ field.covariance @ gain.T)
     return replace(
-        result, error_map=now, budget=_budget(result, now, gain, told),
+        result, error_map=now, budget=_budget(result, now, gain, variances),
         findings=(*result.findings, Finding("prior", size, unit="m", details={
             "length_m": length * pitch_m, "left_out": left_out, "u_rms": rms(u),
             "u_rms_without": rms(np.stack([emap.u_gx, emap.u_gy]))})))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a saved result knows of stage and plate together: covariances of both maps, and between.
+"""Joint covariance of the maps of stage and plate, from a saved result.
 
 Exact for noise and terms of the model. What else enlarges u (unequal noise, noise in time, stages
 read beside the sites) enlarges both maps in the ratio in which it enlarges that of the stage;
@@ -81,7 +81,7 @@ class Together:
         return factors_of(self.result)[int(kept["with_map"]):]
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
-        """Return what terms and effects make of G, of A and of the microscope, (r, q)."""
+        """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
         plate, stage = self._kept("plate", (2, *marks.shape)), factors_of(self.result)
         effects, here = len(self._effects), 2 * int(sites.sum())
         n, r = len(stage) - effects, len(plate)
@@ -153,7 +153,7 @@ class Together:
 
     @cached_property
     def _ratio_of_plate(self) -> float:
-        """The same of the plate's map, which noise of images moves otherwise."""
+        """The same for the plate's map, on which noise of images acts differently."""
         plate, known = self.result.artifact_map, self.marks
         rows = unit_rows(known)
         white = np.trace(self._of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
@@ -191,7 +191,7 @@ class Together:
 
 
 def together(result: CalibrationResult) -> Together | None:
-    """Return what a result knows of stage and plate together; None if that is not all kept."""
+    """Return the joint covariance of stage and plate of a result; None if it is incomplete."""
     result = measured_alone(result)
     if result.method != "joint" or (
             result.model.terms and BESIDE not in result.extra.get(KEY, {})) \

@@ -89,7 +89,7 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     flipped = sense is Sense.PLATE_MOVES
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:
-            raise InputError("theta datum xy_axes", f"of {n_lines} lines none lies on the y axis",
+            raise InputError("theta datum xy_axes", f"of {n_lines} lines, none lies on the y axis",
                              "use zero_mean")
         sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
         slopes = slope_rows(system.grid.views.z_sites * half_width_m, sites)
@@ -113,12 +113,12 @@ def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
     halves = (("+x", known[hx + 1:, hy]), ("+y", known[hx, hy + 1:]), ("-x", known[:hx, hy]),
               ("-y", known[hx, :hy]))
     for (name, half), line in zip(halves, lines, strict=True):
-        what = ("has one site and no slope" if len(half) < 2 else
+        what = ("has one site, which gives no slope" if len(half) < 2 else
                 f"is known at {int(half.sum())} of {len(half)} sites" if not half.all() else
                 "has no known angular line" if not line else "")
         if what:
             raise InputError("theta datum xy_axes", f"the half axis along {name} {what}",
-                             "read what is missing there, or use zero_mean")
+                             "measure what is missing there, or use zero_mean")
 
 
 def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:

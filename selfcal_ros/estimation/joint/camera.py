@@ -32,7 +32,7 @@ POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 cubic ones look like linear ones in three cells."""
 
 UNREAD = 1e-6
-"""Size of a column, or of its part in a combination, that is none."""
+"""Size below which a column, or its part in a combination, counts as zero."""
 
 MOST_U = 5.0
 """Largest uncertainty of the offset in a cell of a view, over their median; others are too few."""
@@ -260,9 +260,9 @@ def _determined(place: np.ndarray, powers: Powers) -> bool:
 
 def _place(views: Sequence[ViewReadings]) -> complex:
     """Return the mean published offset in a cell, stage axes, m."""
-    told = [view for view in views if view.visits is not None]
+    visited = [view for view in views if view.visits is not None]
     return complex(np.mean([view.view.cell_m + (view.visits.offset_x + 1j * view.visits.offset_y)
-                            .mean() for view in told if view.visits is not None]))
+                            .mean() for view in visited if view.visits is not None]))
 
 
 def straightened(measurements: Measurements, camera: Distortion) -> Measurements:

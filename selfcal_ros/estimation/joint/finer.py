@@ -29,7 +29,7 @@ MAX_COEFFICIENTS = 31 * 31
 
 
 class FinerEquations(PlacedEquations):
-    """Equations of a refined map, of which the readings may determine but a part."""
+    """Equations of a refined map, of which the readings may determine only a part."""
 
     @cached_property
     def told(self) -> float:
@@ -112,11 +112,11 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
     problem = replace(problem, system=other, places=None, residuals_xy=None,
                       conditions=replace(problem.conditions, slopes=flat))
-    made = replace(model, problem=problem, found=fit(problem, model.y), reduced=None)
+    refitted = replace(model, problem=problem, found=fit(problem, model.y), reduced=None)
     if model.equations is None:
-        return made
-    weighted = np.isfinite(made.found.xy.sigma)
-    return _with_terms(made, model.equations.columns) if weighted else None
+        return refitted
+    weighted = np.isfinite(refitted.found.xy.sigma)
+    return _with_terms(refitted, model.equations.columns) if weighted else None
 
 
 def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
@@ -152,7 +152,7 @@ def fit_model(problem: Problem,
     Raises
     ------
     NotSettledError, InputError
-        If the rotations do not settle, or a term needs what the readings do not tell.
+        If the rotations do not settle, or a term needs what the readings do not separate.
     """
     model = settled(problem, check)
     sizes = _size_tests(model, problem.terms)

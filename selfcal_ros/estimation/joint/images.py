@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise that the marks of an image share, beside that of each mark (method eq. 4.15).
+"""Noise that the marks of an image share, in addition to that of each mark (method eq. 4.15).
 
 Vibration and noise of the encoders move all marks of an image together. Such noise looks like an
 error of the stage, so that residuals show only part of it. Both noises follow from two sums of
@@ -295,9 +295,9 @@ def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
     gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
     norm = np.abs(flat).max()
     values, vectors = np.linalg.eigh(gram)
-    told = values > UNTOLD * norm**2 * len(flat.T)
-    inverse = (vectors[:, told] / values[told]) @ vectors[:, told].T
-    return FittedYaw(grid.weight, residuals, parameters, inverse, int(told.sum()))
+    determined = values > UNTOLD * norm**2 * len(flat.T)
+    inverse = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
+    return FittedYaw(grid.weight, residuals, parameters, inverse, int(determined.sum()))
 
 
 def _drawn(system: NormalEquations, views: CellsSeen,

@@ -58,7 +58,7 @@ LINEAR = 1e-3
 their own, from which the terms' equations are set up anew."""
 
 OFFSET_STEPS = 10
-"""Most steps in which the offsets that a microscope saw are freed from noise anew."""
+"""Largest number of steps in which noise is removed from the microscope's offsets again."""
 
 FIXED = 1e-12
 """Variance of a misalignment, against the largest, that is rounding: a datum fixes it."""
@@ -302,7 +302,7 @@ class _State:
             self.theta = angular_part(self.problem)
 
     def _of_terms(self, names: Collection[str] | None = None) -> np.ndarray | float:
-        """Return what terms, all or those of `names`, make of the readings, (views, nx, ny), m."""
+        """Return the effect of all terms, or of `names`, on the readings, (views, nx, ny), m."""
         if self.equations is None:
             return 0.0
         rows = None if names is None else self.equations.rows(names)

@@ -373,7 +373,7 @@ def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
 
 
 def turned(problem: Problem) -> Problem:
-    """Return the problem with the readings of each view in the frame of the plate as it lies.
+    """Return the problem with the readings of each view in the frame of the plate as placed.
 
     With the rotation phi0 that a view shows by itself, y' = e^(-i phi0) (y + m) - m. Without it the
     linear model would have the columns of the terms and that of the rotation apart by phi0, and

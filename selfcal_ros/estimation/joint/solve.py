@@ -200,7 +200,7 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
 
 
 def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
-    """Return whether plate and encoders differ in scale by more than they can."""
+    """Return whether plate and encoders differ in scale by more than is plausible."""
     if options.reference is not None or not (
             abs(found.magnification) > options.magnification_limit):
         return ()
@@ -208,7 +208,7 @@ def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
 
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
-    """Return the sites and lines of the map, stage frame, that single readings alone tell."""
+    """Return the sites and lines of the map, stage frame, that only single readings determine."""
     sites = np.argwhere(system.unchecked_sites) - np.array(system.grid.views.half)
     lines = np.argwhere(system.unchecked_lines)
     if not len(sites) and not len(lines):
@@ -245,7 +245,7 @@ def _short(weight: float) -> float | int:
 
 
 def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult, ...]:
-    """Return what was found of each term of the model; those not `declared` are assumed."""
+    """Return the estimates of each term of the model; those not `declared` are assumed."""
     if model.equations is None:
         return ()
     columns, covariance = model.equations.columns.columns, model.covariance

@@ -90,9 +90,9 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
 
 def _require_plain(options: Options) -> None:
     if options.reference is not None:
-        raise InputError("method law", "Hu's law knows no reference length", _JOINT)
+        raise InputError("method law", "Hu's law has no reference length", _JOINT)
     if options.terms:
-        raise InputError("method law", "Hu's law knows no terms beside stage and plate", _JOINT)
+        raise InputError("method law", "Hu's law has no terms besides stage and plate", _JOINT)
     if options.misalignment_model != "linear":
         raise InputError("method law", f"Hu's law is linear, not {options.misalignment_model}",
                          _JOINT)

@@ -217,8 +217,8 @@ class HarmonicSystem(AngularSystem):
     @property
     def rank(self) -> int:
         """Rank of the readings with known rotations."""
-        told = 2 * (self.harmonics - len(self.missed)) + 1
-        return told + self.n_marks - 1
+        determined = 2 * (self.harmonics - len(self.missed)) + 1
+        return determined + self.n_marks - 1
 
     @cached_property
     def missed(self) -> tuple[int, ...]:

@@ -78,13 +78,13 @@ def best_pose(starts: Sequence[Pose], reach: float,
     found = []
     for best in sorted(starts, key=key)[:REFINED]:
         for turn, shift in STEPS:
-            while key(near := min(_beside(best, turn, shift, reach), key=key)) < key(best):
+            while key(near := min(_neighbours(best, turn, shift, reach), key=key)) < key(best):
                 best = near
         found.append(best)
     return min(found, key=key)
 
 
-def _beside(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[Pose]:
+def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[Pose]:
     """Yield the pose and its neighbours: turned, or shifted along one axis."""
     yield pose
     angle, x, y = pose

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The uncertainty budget that a plan promises: noise of the readings, and what is assumed of them.
+"""The predicted uncertainty budget of a plan: noise of the readings, and assumed terms.
 
 What the readings will not determine of a term with a size stays in U (GUM type B). What removes it
 is found by trying: check stops, another visiting order, a further view.

@@ -225,17 +225,17 @@ def _lines_advice(artifact: Artifact, turns: list[float]) -> list[str]:
 
 
 def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
-    """Return the turn, in whole degrees, of the further view that tells most of a Fourier map."""
+    """Return the turn, in whole degrees, of the further view that adds most to a Fourier map."""
     of_turns, number = np.exp(1j * np.outer(turns_rad, np.arange(1, harmonics + 1))), len(turns_rad)
     turns_deg = np.arange(1, 180)
     more = of_turns.sum(axis=0) + np.exp(
         1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1)))
-    told = number + 1 - np.abs(more) ** 2 / (number + 1)  # information on each, in 2 / K
-    return int(turns_deg[(1 / np.maximum(told, 1e-12)).sum(axis=1).argmin()])
+    information = number + 1 - np.abs(more) ** 2 / (number + 1)  # information on each, in 2 / K
+    return int(turns_deg[(1 / np.maximum(information, 1e-12)).sum(axis=1).argmin()])
 
 
 def refusal(observability: Observability) -> str:
     """Return the line that refuses a deficient measurement and names the cure."""
     modes = f"{observability.deficiency} mode" + "s" * (observability.deficiency != 1)
-    return (f"the marks that were read do not identify the stage ({modes} unseen): "
+    return (f"the marks that were read do not identify the stage ({modes} undetermined): "
             + "; ".join(observability.advice))

@@ -137,7 +137,7 @@ def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
                              for p, a in zip(period, "xy", strict=True) if p > 1)
         return "periodic fields", f"patterns that repeat {along} ({2 * n} numbers)"
     return ("separate groups of sites", f"{n} groups of sites that no reading connects: "
-            f"each may move by itself; the smallest is {_smallest(grid, label)}")
+            f"each may move independently; the smallest is {_smallest(grid, label)}")
 
 
 def _period(label: np.ndarray) -> tuple[int, int] | None:

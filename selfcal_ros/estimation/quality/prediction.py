@@ -90,9 +90,9 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     own = [out[:0]]
     if equations is not None:
         ground = _in_time_of(ground, grid, kept, held)
-        made = term_columns(ground, problem.terms, problem.drift_degree)
+        columns = term_columns(ground, problem.terms, problem.drift_degree)
         at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
-        for column, block in zip(made.columns, made.grid, strict=True):
+        for column, block in zip(columns.columns, columns.grid, strict=True):
             if column.term in OF_LINES:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1

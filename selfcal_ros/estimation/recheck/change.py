@@ -61,7 +61,7 @@ class KnownPlate:
 
     @property
     def microscope(self) -> np.ndarray | None:
-        """Coefficients of the microscope that it found, (4,); None if it did not seek them."""
+        """Coefficients of the microscope that it found, (4,); None if it did not estimate them."""
         term = next((term for term in self.result.model.terms
                      if term.name == TermName.MICROSCOPE), None)
         if term is None:
@@ -87,7 +87,7 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
         If it is not qualified, or does not have what the plate's covariance needs.
     """
     if "recheck" in result.extra:
-        raise InputError(where, "is itself a recheck, which calibrates no plate",
+        raise InputError(where, "is itself a recheck, which does not calibrate a plate",
                          f"name the calibration that it used, {result.extra['recheck']['of']}")
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(where, "is not qualified, so its plate is not known",
@@ -193,7 +193,7 @@ class NewMap:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Change of a map: new less old, without motion, and without scale where none is known.
+    """Change of a map: new minus old, without motion, and without scale where none is known.
 
     Attributes
     ----------

@@ -73,8 +73,8 @@ class ChangeTests:
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (r,) and axes (2n, r) of the change over `u`."""
         values, vectors = np.linalg.eigh(self._own / np.outer(self.u, self.u))
-        told = values > NO_VARIANCE * values[-1]
-        return np.sqrt(values[told]), vectors[:, told]
+        determined = values > NO_VARIANCE * values[-1]
+        return np.sqrt(values[determined]), vectors[:, determined]
 
     @cached_property
     def _smooth(self) -> np.ndarray:
@@ -119,7 +119,7 @@ class ChangeTests:
         return np.sort(found, axis=1), np.sort(ranks.min(axis=0))
 
     def p(self, values: np.ndarray) -> float:
-        """Return the probability of as telling a change, (2n,), if there is none."""
+        """Return the probability of as significant a change, (2n,), if there is none."""
         found, (drawn, least) = self.of(values[:, None])[:, 0], self._drawn
         rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
                    for row, one in zip(drawn, found, strict=True))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What views of a known plate will tell, before any is measured."""
+"""Predictions for views of a known plate, before any is measured."""
 
 from dataclasses import dataclass, replace
 
@@ -33,7 +33,7 @@ class PlannedRecheck:
 
 @one_thread()
 def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
-    """Return what views of a known plate will tell, with the noise of its calibration.
+    """Return the predictions for views of a known plate, with the noise of its calibration.
 
     Raises
     ------

@@ -72,7 +72,7 @@ LEAST_PART = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Rechecked:
-    """What views of a known plate tell.
+    """Results from views of a known plate.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Rechecked:
 
 
 def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
-    """Return what `recheck` makes its result of."""
+    """Return the parts from which `recheck` assembles its result."""
     if options.method != "joint" or options.reference is not None:
         raise InputError("options", "a recheck always uses the method joint and the reference "
                          "length of the plate's calibration", "leave both out")
@@ -214,7 +214,7 @@ def plate_readings(measurements: Measurements, options: Options,
 
 
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
-    """Return the terms of the model; views of a known plate do not tell those without a size."""
+    """Return the terms; views of a known plate do not determine those without a size."""
     terms = tuple(term for term in options.model_terms(
         visits=visits, assumed=options.finite_rotations) if term.name is not TermName.ROTATION)
     for term in terms:

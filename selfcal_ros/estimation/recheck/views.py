@@ -32,7 +32,7 @@ MOST_DATUMS = 12
 """Most datums from that of the core to that of the known nodes."""
 
 STILL = 1e-13
-"""Change of a reading, m, that is none."""
+"""Change of a reading, m, that counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class PlateReadings:
     measurements : Measurements
         The readings.
     problem : Problem
-        The same in the frame of the plate as it lies.
+        The same in the frame of the plate as placed.
     columns : TermColumns
         Terms of the model.
     at : tuple of int arrays (r,)
@@ -149,7 +149,7 @@ class PlateReadings:
         return out - (out @ grid.differences) @ grid.differences.T
 
     def of_terms(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the terms of the marks make of the readings, (r, p), and their sizes, (p,).
+        """Return the effect of terms on the readings, (r, p), and their sizes, (p,).
 
         But for the microscope's.
         """
@@ -315,9 +315,9 @@ def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: n
             moved = places.moved(field, near)
             taken = taken + places.changes(moved, problem.turn_rad)[at]
         if np.abs(taken - before).max() <= STILL:
-            told = round(float(np.einsum("ij,ji->", gain.rows, design)))
+            rank = round(float(np.einsum("ij,ji->", gain.rows, design)))
             return Seen(known, field, found[2 * n:], gain, right - design @ found,
-                        len(right) - told)
+                        len(right) - rank)
     raise NotSettledError("recheck", "the rotations of the plate do not converge",
                           "check the readings for misalignments of more than a few degrees")
 

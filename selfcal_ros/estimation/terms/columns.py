@@ -257,9 +257,9 @@ def joined(ground: TermInputs, first: TermColumns, second: TermColumns) -> TermC
 def _require_visits(ground: TermInputs, name: TermName) -> None:
     for view, visits in zip(ground.names, ground.visits, strict=True):
         if visits is None:
-            raise InputError(f"view '{view}'", f"the term '{name}' needs to know when, with which "
-                             "offset and from where each mark was read, and the readings do not "
-                             "tell it", "solve from the bag, or leave the term out")
+            raise InputError(f"view '{view}'", f"the term '{name}' needs the time, the offset and "
+                             "the direction of approach of each reading, and the readings do not "
+                             "contain them", "solve from the bag, or leave the term out")
 
 
 def _drift_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm, degree: int) -> None:
@@ -323,7 +323,7 @@ def _yaw_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> No
 
 
 def _beside_cells(ground: TermInputs) -> np.ndarray:
-    """Return where marks are beside the places of their cells, stage axes, (views, marks), m.
+    """Return the offsets of marks from the places of their cells, stage axes, (views, marks), m.
 
     Of a cell the mean is that on the optical axis: its own holds the camera's error there.
     """

@@ -23,8 +23,8 @@ OVER_NOISE = 100.0
 microscope: below, they would be dominated by their own noise, which is in the readings as well."""
 
 MOVES_THE_MAP = 1e-5
-"""Relative rms of the map above which an undetermined combination of columns is an unseen mode:
-rounding gives 1e-9, the smallest true ones 1e-2."""
+"""Relative rms of the map above which a combination of columns that cannot be seen is an
+undetermined mode: rounding gives 1e-9, the smallest true ones 1e-2."""
 
 NO_VARIANCE = 1e-12
 """Relative size below which a variance is zero."""
@@ -351,8 +351,8 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     for name in sized:
         at = columns.rows([name])
         values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
-        told = values > NO_VARIANCE * max(values[-1], 0.0)
-        root = rest[:, at] @ (vectors[:, told] / np.sqrt(values[told]))
+        determined = values > NO_VARIANCE * max(values[-1], 0.0)
+        root = rest[:, at] @ (vectors[:, determined] / np.sqrt(values[determined]))
         rest = rest - root @ root.T
         out.append((str(name), root))
     own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))

@@ -123,7 +123,7 @@ class StagePlaces:
 
     def about(self, field: np.ndarray, near: np.ndarray,
               turn_rad: np.ndarray) -> list[np.ndarray | float]:
-        """Return what visits of each view have more than the mean of their mark, (V,), m.
+        """Return the excess of the visits of each view over the mean of their mark, (V,), m.
 
         By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
         """
@@ -197,7 +197,7 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
     """
     views = maps_of(grid.y.shape[1:], grid.poses)
     away = np.zeros(grid.y.shape, dtype=complex)
-    told = np.zeros(away.shape, dtype=bool)
+    located = np.zeros(away.shape, dtype=bool)
     marks: list[np.ndarray | None] = []
     about: list[np.ndarray | None] = []
     for row, (index, visits) in enumerate(zip(grid.index, ground.visits, strict=True)):
@@ -208,15 +208,15 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
             continue
         stood = found.dx - found.offset_x + 1j * (found.dy - found.offset_y)
         mean = visits.means(stood[None], grid.y[0].size)[0]
-        away[row], told[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
+        away[row], located[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
         marks.append(visits.mark)
         about.append(stood - mean[visits.mark])
     if isinstance(views, LatticeViews):
-        told &= known.reshape(-1)[views.site_index] & (grid.weight > 0)
+        located &= known.reshape(-1)[views.site_index] & (grid.weight > 0)
         pitch_m = ground.half_width_m / views.unit
     else:
-        told, pitch_m = told & views.near(known) & (grid.weight > 0), views.spline.pitch_m
-    if not np.abs(away[told]).max(initial=0.0) > AT_SITES * pitch_m:
+        located, pitch_m = located & views.near(known) & (grid.weight > 0), views.spline.pitch_m
+    if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
-    return StagePlaces(views, pitch_m, known, np.nonzero(told), away[told], tuple(marks),
+    return StagePlaces(views, pitch_m, known, np.nonzero(located), away[located], tuple(marks),
                        tuple(about))

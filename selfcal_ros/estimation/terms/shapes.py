@@ -176,7 +176,7 @@ def shapes_in_full(columns: np.ndarray) -> Shapes:
 
 @dataclass(frozen=True, eq=False)
 class WithinMarks:
-    """What the visits of each mark tell about the coefficients, and leave: see `visits`.
+    """Information on the coefficients from the visits of each mark: see `visits`.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ class WithinMarks:
 
 
 def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes) -> WithinMarks:
-    """Return what the means of the marks hide.
+    """Return within-mark sums lost by averaging.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shap
 
 def within_anew(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes, *,
                 before: WithinMarks, changed: np.ndarray) -> WithinMarks:
-    """Return what the means hide, the products of the shapes `changed` set up anew."""
+    """Return the same, with the products of the shapes `changed` recomputed."""
     n_marks = shapes.lattice[0] * shapes.lattice[1]
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)

@@ -228,5 +228,5 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
                     deficiency=seen.deficiency + modes, identifiable=False, modes=texts,
                     advice=advice)
     raise NotIdentifiableError(
-        f"the readings do not tell {' and '.join(by_term)} from the stage "
-        f"({modes} mode{'s' * (modes != 1)} unseen): " + "; ".join(advice), found)
+        f"the readings do not separate {' and '.join(by_term)} from the stage "
+        f"({modes} mode{'s' * (modes != 1)} undetermined): " + "; ".join(advice), found)

@@ -159,9 +159,9 @@ def _check(visits: GridVisits, view: ViewReadings) -> None:
                visits.offset_y, visits.approach_x, visits.approach_y)
     if any(len(column) != number for column in columns):
         raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches differ "
-                         "in length", "give one value a visit")
+                         "in length", "give one value per visit")
     if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
-        raise InputError(where, "a visit is of none of the marks that were read",
+        raise InputError(where, "a visit belongs to none of the marks that were read",
                          "number the marks as `m` and `n` have them")
     if visits.count.min() < 1:
         raise InputError(where, "a count below 1", "leave out visits without a reading")

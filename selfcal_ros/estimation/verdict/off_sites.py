@@ -106,9 +106,9 @@ def slip_columns(ground: TermInputs) -> tuple[TermColumns, dict[tuple[int, float
             groups[view, float(part)] = list(range(len(columns), len(columns) + 3))
             columns += [Column(SLIP, view, text, np.inf) for text in ("x", "y", "phi")]
             shapes += [(after * visits.phase, (1, 1j)), (after * at, (1j,))]
-    made = columns_from(ground, columns, shapes)
+    columns_made = columns_from(ground, columns, shapes)
     rows = {key: np.isin(np.arange(len(columns)), at) for key, at in groups.items()}
-    return made, rows
+    return columns_made, rows
 
 
 def _after(visits: ViewVisits, part: float) -> np.ndarray:

@@ -40,7 +40,7 @@ ADEQUACY_LEVEL = 1e-3
 """Probability that a map that suffices fails the test."""
 
 SIZES = (1e-2, 1e6, 65)
-"""Sizes of the further coefficients that are tried, in the noise of the best told, and number."""
+"""Trial sizes of the further coefficients, over the noise of the best one, and their number."""
 
 NOISE_FREE_M = 1e-13
 """Noise that is rounding, m: a map that leaves no more than that suffices."""
@@ -256,7 +256,7 @@ def _rigid(at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Further:
-    """What the readings tell of the coefficients e by which a refined map differs from a coarse.
+    """Information on the coefficients e by which a refined map differs from a coarse one.
 
     The refined map is the coarse one and Z e, Z e = 0 at the nodes; all else is eliminated.
 
@@ -307,10 +307,10 @@ class _Further:
     def size(self, sigma_m: float) -> float:
         """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
         seen = self.told > GAP * self.told.max()
-        told, right = self.told[seen], self.right[seen]
-        least = sigma_m / np.sqrt(told.max())
+        values, right = self.told[seen], self.right[seen]
+        least = sigma_m / np.sqrt(values.max())
         sizes = np.concatenate([[0.0], least * np.geomspace(*SIZES)])
-        variance = told * sigma_m**2 + np.multiply.outer(sizes, told) ** 2
+        variance = values * sigma_m**2 + np.multiply.outer(sizes, values) ** 2
         return float(sizes[(np.log(variance) + right**2 / variance).sum(axis=1).argmin()])
 
     def power(self, sigma_m: float) -> np.ndarray:

@@ -13,7 +13,7 @@ SIDES = 5
 """Steps of a diverging scale to either side of its middle: ``d0`` to ``d10``."""
 
 SERIES = 6
-"""Colours of series, ``c0`` to ``c5`` (Okabe and Ito); then they begin anew."""
+"""Colours of series, ``c0`` to ``c5`` (Okabe and Ito); then they repeat."""
 
 _PLAIN = {
     "ink": ("#16202a", "#e7ecf1"), "soft": ("#55606a", "#a3afba"), "paper": ("#ffffff", "#14191e"),

@@ -56,7 +56,7 @@ def map_picture(result: CalibrationResult,
     pictures = [error_map(result, truth)]
     if result.artifact.angular_count:
         pictures.append(angular_map(result, truth))
-    return _beside(pictures, state_sentence(result), _origin(result))
+    return _side_by_side(pictures, state_sentence(result), _origin(result))
 
 
 def difference_picture(a: CalibrationResult, b: CalibrationResult,
@@ -87,10 +87,10 @@ def difference_picture(a: CalibrationResult, b: CalibrationResult,
     if np.isfinite(difference["g_theta"]).any():
         pictures.append(angular_map(of_both, title="B − A in θ in arcsec, outwards = "
                                     "counter-clockwise"))
-    return _beside(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
+    return _side_by_side(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
 
 
-def _beside(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
+def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
     """Return pictures side by side below a heading, with lines on their origin."""
     margin, top = 28.0, 30.0
     width = margin + len(pictures) * (parts.WIDTH + margin)
@@ -156,7 +156,7 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     parts.arrow_key(frame, factor, (LEFT, top + height + 58))
     thin = "" if step == 1 else f", every {parts.ordinal(step)} site"
     drawing.label(LEFT + 130, top + height + 62, f"vectors enlarged {factor:,.0f} ×{thin}"
-                  if emap.valid.any() else "not one site is known")
+                  if emap.valid.any() else "no site is known")
     parts.legend(drawing, entries, (LEFT, top + height + 82))
     drawing.height = top + height + 92
     return drawing

@@ -48,7 +48,7 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
     """
     kind = FilePath(path).suffix.lower()
     if kind not in KINDS:
-        raise InputError(str(path), "no kind of picture by its ending",
+        raise InputError(str(path), "not a picture format by its suffix",
                          "name a file that ends in .png, .svg or .pdf")
     with rc_context(RC):
         page = Figure(figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH))

@@ -39,12 +39,12 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     for frame, view in zip(parts.panels(drawing, titles, reach), views, strict=True):
         _plate(frame, view, artifact)
         frame.border()
-    said = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
+    legend = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
             "small dots: only lines are read; hollow: off the field, not read"]
     if aside := {view.check_offset_m for view in views if view.check_marks}:
-        said.append("crosses: check stops, seen again with the stage "
+        legend.append("crosses: check stops, measured again with the stage "
                     f"{' or '.join(f'{each * UM_PER_M:.6g}' for each in sorted(aside))} µm off")
-    for line in said:
+    for line in legend:
         drawing.height += 18
         drawing.label(46, drawing.height - 12, line, size=11.5, colour="soft")
     return drawing
@@ -163,7 +163,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
         Counter(row[1] for row in found).most_common())}
-    drawing = parts.titled("rejected", "Rejected grid readings, where they happened")
+    drawing = parts.titled("rejected", "Positions of rejected grid readings")
     for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")

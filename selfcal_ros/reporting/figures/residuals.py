@@ -30,7 +30,7 @@ class ViewResiduals:
         Grid residuals by mark, stage axes, m; NaN where not read.
     course : float array (4, parts)
         Time (s, from the first reading of the run), mean x and y (m) and number of the readings
-        in each part of the view's time; without parts where that is not known.
+        in each fraction of the view's duration; without parts where that is not known.
     theta_rad : float array (K,)
         Angular residuals by line, rad; NaN where not read.
     """
@@ -256,7 +256,7 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
         *(parts.Curve((tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash)
           for number, name in enumerate(names) for axis, dash in (("x", ()), ("y", (5, 3)))
           if (name, axis) in paths)],
-        x=(0.0, 1.0), y=(-end, end), labels=("part of the view's time", ""))
+        x=(0.0, 1.0), y=(-end, end), labels=("fraction of the view's duration", ""))
     y = 34 + 190 + 62.0
     for first in range(0, len(names), 3):
         parts.legend(drawing, [(f"c{i % SERIES}", parts.shortened(name, 16)) for i, name in

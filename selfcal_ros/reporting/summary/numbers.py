@@ -333,7 +333,7 @@ NUMBERS = ("scale", "rotation", "stretch", "shear", "u_scale", "u_rotation", "u_
 PERCENT = 100
 YAW = ("x", "y", "yaw", "u_yaw")
 TURNS = 1e-3
-"""Probability of its readings below which a stage is said to turn."""
+"""p value below which a yaw of the stage is reported as significant."""
 
 
 def cells_of(result: CalibrationResult) -> np.ndarray:
@@ -350,7 +350,7 @@ def cells_of(result: CalibrationResult) -> np.ndarray:
 
 
 def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
-    """Return what images tell of the camera, published minus true offset; empty without images."""
+    """Return the camera's error shown by images, published minus true; empty without images."""
     cells, yaw = cells_of(result), yaw_facts(result)
     if not cells.size:
         return yaw
@@ -365,7 +365,7 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     size, u = math.hypot(*cells[2:4, worst]), math.hypot(*cells[4:6, worst]) / math.sqrt(2)
     parts = [name for name, power in (("quadratic", [2, 0]), ("radial (cubic)", [2, 1]))
              if power in [c.get("power") for c in camera.get("coefficients", [])]]
-    return (("scale", told("scale", PERCENT, "%") + ", offsets published too long where positive"),
+    return (("scale", told("scale", PERCENT, "%") + ", positive: published offsets too long"),
             ("rotation", told("rotation", MRAD_PER_RAD, "mrad")),
             ("stretch, shear", f"{told('stretch', PERCENT, '%')}, {told('shear', PERCENT, '%')}"),
             ("distortion", " and ".join(parts) or "none shown"),
@@ -387,7 +387,7 @@ def yaw_of(result: CalibrationResult) -> np.ndarray:
 
 
 def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
-    """Return what images tell of the rotation of the stage; empty without images."""
+    """Return the yaw of the stage shown by images; empty without images."""
     _, _, yaw, u = yaw_of(result)
     if not yaw.size:
         return ()

@@ -126,13 +126,13 @@ def measurement_section(result: CalibrationResult) -> Section:
              ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
               f"{result.model.misalignment} misalignments"),
              ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
-              f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'unseen mode')})")]
+              f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'undetermined mode')})")]
     plate_map = result.artifact_map
     if math.isfinite(plate_map.magnification):
         value, u = (x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification))
         spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
         facts.append(("magnification", f"plate {'larger' if value >= 0 else 'smaller'} than the "
-                      f"encoders say by {significant(abs(value))}{spread} µm/m"))
+                      f"encoders indicate by {significant(abs(value))}{spread} µm/m"))
     if result.input.get("file"):
         digest = printable(result.input.get("sha256") or "")
         facts.append(("input", printable(result.input["file"])
@@ -309,7 +309,7 @@ def rejected_section(result: CalibrationResult) -> Section:
 def attention_section(result: CalibrationResult) -> Section:
     """Return unseen modes, advice and warnings, which require action."""
     seen = result.observability
-    lines = [f"unseen mode: {printable(mode)}" for mode in seen.modes]
+    lines = [f"undetermined mode: {printable(mode)}" for mode in seen.modes]
     lines += [f"advice: {printable(advice)}" for advice in seen.advice]
     lines += [f"warning: {printable(warning)}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
@@ -321,9 +321,9 @@ def state_sentence(result: CalibrationResult) -> str:
     if not seen.identifiable:
         advice = f"; {printable(seen.advice[0])}" if seen.advice else ""
         return (f"Not a calibration: {counted(seen.deficiency, 'mode')} of the stage error cannot "
-                f"be seen from the marks that were read{advice}.")
+                f"be determined from the marks that were read{advice}.")
     if not figures.n_known and not figures.n_lines_known:
-        return "No calibration: not one site of the error map is known."
+        return "No calibration: no site of the error map is known."
     k = result.noise.k_theta
     text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
     if result.verdict.grade is Grade.GOOD:

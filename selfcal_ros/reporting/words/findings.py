@@ -116,7 +116,7 @@ _CAUSES: dict[str, Words] = {
     TermName.LINE_ECCENTRICITY: lambda c, of: (
         f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
         f"view '{c.view}'"),
-    TermName.YAW: lambda c, of: f"a stage that turns by up to {plus_minus(c, URAD)} on its way",
+    TermName.YAW: lambda c, of: f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel",
     TermName.APPROACH: lambda c, of: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"),
@@ -133,10 +133,10 @@ _CAUSES: dict[str, Words] = {
         f"a stage that stood {of['away'] * MM_PER_M:.3g} mm off the sites, where its error differs "
         f"by {plus_minus(c, UM)}"),
     "roughness": lambda c, of: (
-        f"a rotary encoder rougher than the {of['harmonics']} harmonics of its map follow, by "
+        f"a rotary encoder rougher than the {of['harmonics']} harmonics of its map can follow, by "
         f"{c.size * ARCSEC_PER_RAD:.3g} arcsec (rms)" if c.unit == "rad" else
-        f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map follow, "
-        f"by {c.size * UM_PER_M:.3g} µm (rms)"),
+        f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map can "
+        f"follow, by {c.size * UM_PER_M:.3g} µm (rms)"),
     "noise": lambda c, of: (
         f"{c.size:.2f} times as much noise in view '{c.view}' as in the others")}
 
@@ -173,7 +173,7 @@ SENTENCES: dict[str, Words] = {
         "the pixel size, or add check stops, which determine the scale"),
     "not_converged": lambda f, of: (
         "the estimate converged only without the assumptions about the measurement, which the "
-        "readings are far from: check the sense, the axes and the pixel size of the microscope"),
+        "readings do not fit: check the sense, the axes and the pixel size of the microscope"),
     "finite_rotation": lambda f, of: (
         f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
         "solve jointly with finite rotations, the default, which leaves "
@@ -191,7 +191,7 @@ SENTENCES: dict[str, Words] = {
         f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
         f"beyond the limit of {of['limit']:.2f}"),
     "between_runs": lambda f, of: (
-        f"the {of['runs']} runs differ by more than their uncertainties: a part of "
+        f"the {of['runs']} runs differ by more than their uncertainties: a variation of "
         f"{f.size * (UM if f.unit == 'm' else ARCSEC).per_si:.3g} "
         f"{(UM if f.unit == 'm' else ARCSEC).name} (rms) between runs, p = {f.p:.2g}, is in U"),
     "enlarged_runs": lambda f, of: (
@@ -202,20 +202,20 @@ SENTENCES: dict[str, Words] = {
     "no_uncertainty": lambda f, of: (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
     "roughness_untested": lambda f, of: (
-        "whether the nodes of the map suffice for the stage was not tested, and U contains nothing "
-        "for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the readings too few, "
-        "for a finer map; solve with fewer nodes once, or add a view"),
+        "whether the nodes of the map suffice for the stage was not tested, and U has no "
+        "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
+        "readings too few, for a finer map; solve with fewer nodes once, or add a view"),
     "visited_once": lambda f, of: (
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
         "marks there and back, along x and along y"),
     "prior": lambda f, of: (
-        "the map has a prior: its error beyond first order is taken for a smooth random field of "
-        f"{f.size * UM_PER_M:.3g} µm and a correlation length of {of['length_m'] * MM_PER_M:.3g} "
-        f"mm, as the readings show; by these alone u would be {of['u_rms_without'] * UM_PER_M:.3g} "
-        f"instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)" + (
-            f"; {_counted([tuple(at) for at in of['left_out']], 'node')} may stand off that field: "
-            "no prior there" if of["left_out"] else "")),
+        "the map has a prior: its error beyond first order is modelled as a smooth random field of "
+        f"{f.size * UM_PER_M:.3g} µm with a correlation length of {of['length_m'] * MM_PER_M:.3g} "
+        "mm, estimated from the readings; without it u would be "
+        f"{of['u_rms_without'] * UM_PER_M:.3g} instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)" + (
+            f"; {_counted([tuple(at) for at in of['left_out']], 'node')} may deviate from that "
+            "field: no prior there" if of["left_out"] else "")),
     "few_read": phrases.few_read_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (

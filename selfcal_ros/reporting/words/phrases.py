@@ -17,7 +17,7 @@ _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
            "declared": "declared by the detections"}
 
 OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
-              "terms": "sizes of the terms of the model, which these views do not tell"}
+              "terms": "sizes of the terms of the model, which these views do not determine"}
 """How a line of the budget was found, given the file of the plate."""
 
 
@@ -49,7 +49,7 @@ def few_read_text(found: Finding, of: dict[str, Any]) -> str:
         for one in of["cells"])
     unknown = "the camera's error could not be determined" if of["unknown"] is None else (
         f"the camera's error is not known in {_named(of['unknown'])}")
-    return (f"few marks were read {where}: look for dirt or a shadow in what the camera sees there"
+    return (f"few marks were read {where}: look for dirt or a shadow in that part of the image"
             + (f"; {unknown}" if of["unknown"] != [] else ""))
 
 
@@ -155,7 +155,7 @@ def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
     since = printable(os.path.basename(str(of["of"])))
     return (f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
             f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
-            "u, and neighbouring marks have nothing in common, unlike the errors of a stage: check "
+            "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
             "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
             "again")
 

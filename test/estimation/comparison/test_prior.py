@@ -87,7 +87,7 @@ def test_a_stage_smooth_and_rough_at_once_contradicts_it():
     rough = replace(plain, error_map=replace(
         plain.error_map, gx=plain.error_map.gx + rng.normal(0, 0.7 * SIGMA_M, (11, 11)),
         gy=plain.error_map.gy + rng.normal(0, 0.7 * SIGMA_M, (11, 11))))
-    with pytest.raises(InputError, match="prior: the readings contradict a stage that is a smooth"):
+    with pytest.raises(InputError, match="prior: the readings contradict a smooth stage error"):
         with_prior(rough, xy_covariance)
 
 

@@ -87,7 +87,7 @@ def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
         "u_dy": None}
     assert found.warnings == (
         "few marks were read in cell [+1,+1] of the images (0 of 72): look for dirt or a shadow in "
-        "what the camera sees there; the camera's error is not known in cell [+1,+1]",)
+        "that part of the image; the camera's error is not known in cell [+1,+1]",)
     assert state_sentence(found).startswith(
         "Calibrated from 2 views with images of 9 marks, few of them read in cell [+1,+1]: largest")
     assert dict(camera_facts(found))["distortion"] == "radial (cubic)"
@@ -100,7 +100,7 @@ def test_a_cell_that_one_view_lacks_is_named_with_the_view():
     (said,) = worded(calibrate(with_dirt(measurements, {
         ("90", CORNER): 17, ("0", (0, -1)): 21}))).warnings
     assert said == ("few marks were read in cell [+1,+1] of the images of view '90' (17 of 36): "
-                    "look for dirt or a shadow in what the camera sees there")
+                    "look for dirt or a shadow in that part of the image")
 
 
 def test_two_rows_of_cells_show_the_linear_part():

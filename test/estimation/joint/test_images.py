@@ -251,7 +251,7 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
 
 def test_hus_law_refuses_images():
     _, measurements = measured(MARK, 1, size=5)
-    with pytest.raises(InputError, match="Hu's law has no place for images of several marks; "
+    with pytest.raises(InputError, match="Hu's law cannot use images of several marks; "
                                          "solve with --method"):
         calibrate(measurements, Options(method="law"))
 

@@ -287,8 +287,8 @@ def test_half_axes_that_are_not_known_as_a_whole_are_refused():
     axes = bare(datum_theta="xy_axes")
     with pytest.raises(InputError) as caught:
         calibrate(readings, axes)
-    assert str(caught.value) == ("theta datum xy_axes: the half axis along +x has one site and no "
-                                 "slope; read what is missing there, or use zero_mean")
+    assert str(caught.value) == ("theta datum xy_axes: the half axis along +x has one site, which "
+                                 "gives no slope; measure what is missing there, or use zero_mean")
     _, readings = measured(hu_plan(Artifact(7, 0.01, 24)))
     end = replace(readings, views=tuple(  # the site at the end of -y is never visited
         without_site(view, (0, -3), readings.artifact) for view in readings.views))

@@ -127,8 +127,8 @@ def test_groups_that_no_reading_joins_are_counted_and_the_smallest_is_named():
     plan = plan_of("0, tx2", 5, size_y=3)
     family = next(mode for mode in unseen_modes(planned_system(plan.artifact, plan.views))
                   if mode.name == "separate groups of sites")
-    assert family.text == ("6 groups of sites that no reading connects: each may move by itself; "
-                           "the smallest is (-1, -1), (1, -1)")
+    assert family.text == ("6 groups of sites that no reading connects: each may move "
+                           "independently; the smallest is (-1, -1), (1, -1)")
 
 
 def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_difference():
@@ -268,7 +268,7 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
     with pytest.raises(NotIdentifiableError) as refusal:
         calibrate(readings, BARE)
-    assert "2 modes unseen" in str(refusal.value)
+    assert "2 modes undetermined" in str(refusal.value)
     assert "add a view turned by 90 deg" in str(refusal.value)
     seen = refusal.value.observability
     assert seen.modes == ("non-orthogonality of the axes: Gx = O y, Gy = O x",

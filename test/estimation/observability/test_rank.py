@@ -87,7 +87,7 @@ def test_angular_views_without_a_line_turn_are_refused():
     plan = plan_of("0,90,tx", artifact)
     rng = np.random.default_rng(0)
     readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng)
-    with pytest.raises(NotIdentifiableError, match=r"5 modes unseen.*1 line \(15 deg\)"):
+    with pytest.raises(NotIdentifiableError, match=r"5 modes undetermined.*1 line \(15 deg\)"):
         calibrate(readings)
 
 

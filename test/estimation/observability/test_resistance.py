@@ -130,7 +130,7 @@ def test_free_terms_that_are_not_told_are_named_with_their_cure():
     plan = plan_of("0, 90, tx", 5)
     seen = check_plan(plan).observability
     planned = PlannedTerms(plan, parse_terms(["drift"], ""), Assumed(order="raster"))
-    with pytest.raises(NotIdentifiableError, match=r"do not tell drift from the stage \(7 modes"):
+    with pytest.raises(NotIdentifiableError, match=r"do not separate drift .*\(7 modes"):
         planned.require_told(seen)
     found = planned.told(seen)
     assert (found.rank, found.unknowns) == (seen.rank + 18 - 7, seen.unknowns + 18)

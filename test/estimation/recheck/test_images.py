@@ -172,5 +172,5 @@ def test_a_plate_calibrated_with_one_mark_an_image_does_not_tell_its_noise():
     _, before, after = sessions(MARK, 1, size=5)
     first = calibrate(before)
     alone = replace(first, extra={k: v for k, v in first.extra.items() if k != KEY})
-    with pytest.raises(InputError, match="not told apart into that of images and that of marks"):
+    with pytest.raises(InputError, match="not separated into that of images and that of marks"):
         calibrate(after, Options(plate=alone, plate_from="r.json"))

@@ -243,8 +243,8 @@ def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
 @pytest.mark.parametrize(("change", "message"), [
     ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
     ({"method": "law"}, "does not contain the covariance of its plate"),
-    ({"extra": {"recheck": {"of": "first.json"}}}, "which calibrates no plate; name the "
-                                                   "calibration that it used, first.json")])
+    ({"extra": {"recheck": {"of": "first.json"}}}, "which does not calibrate a plate; name "
+                                                   "the calibration that it used, first.json")])
 def test_results_without_a_known_plate(change, message):
     with pytest.raises(InputError, match=f"r.json: .*{message}"):
         known_plate(replace(calibrated(), **change), "r.json")

@@ -98,8 +98,9 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
     _, readings = measured(plan_of(order="raster", repeats=1), still, sigma_m=20e-9)
     with pytest.raises(NotIdentifiableError) as caught:
         calibrate(readings, bare(terms=parse_terms(["drift"], ""), drift_degree=1))
-    assert str(caught.value).startswith("the readings do not tell drift from the stage (2 modes "
-                                        "unseen): drift: visit the marks in more than one order")
+    assert str(caught.value).startswith("the readings do not separate drift from the stage (2 "
+                                        "modes undetermined): drift: visit the marks in more "
+                                        "than one order")
     assert caught.value.observability.deficiency == 2
     assert not caught.value.observability.identifiable
     u = {}
@@ -149,8 +150,8 @@ def test_an_axis_that_arrives_from_one_side_alone_has_no_approach_and_keeps_its_
 def test_terms_need_visits():
     _, readings = measured(plan_of())
     without = replace(readings, views=tuple(replace(v, visits=None) for v in readings.views))
-    with pytest.raises(InputError, match="view '0': the term 'drift' needs to know when, with "
-                       "which offset and from where"):
+    with pytest.raises(InputError, match="view '0': the term 'drift' needs the time, the offset "
+                       "and the direction of approach of each reading"):
         calibrate(without, bare(terms=parse_terms(["drift"], "")))
     assert calibrate(without, bare(terms=parse_terms(["plate_scale"], ""))).model.terms
 

@@ -71,8 +71,8 @@ def with_visits(**changed):
     ({"offset_x": np.full(9, np.nan)}, "a deviation or offset is not a finite number"),
     ({"offset_y": np.full(9, 1e6)}, "a deviation or offset is not a finite number"),
     ({"dy": np.full(9, -np.inf)}, "a deviation or offset is not a finite number"),
-    ({"mark": np.arange(1, 10)}, "a visit is of none of the marks that were read"),
-    ({"mark": np.arange(-1, 8)}, "a visit is of none of the marks that were read"),
+    ({"mark": np.arange(1, 10)}, "a visit belongs to none of the marks that were read"),
+    ({"mark": np.arange(-1, 8)}, "a visit belongs to none of the marks that were read"),
     ({"count": np.arange(9)}, "a count below 1"),
     ({"approach_y": np.zeros(8)}, "differ in length")])
 def test_visits_that_cannot_be_are_refused_in_one_line(changed, reason):

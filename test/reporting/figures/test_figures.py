@@ -202,7 +202,7 @@ def test_a_map_without_one_known_site_says_so():
     result, _ = known_result(3, 0)
     nothing = np.full((3, 3), np.nan)
     drawing = error_map(replace(result, error_map=replace(result.error_map, gx=nothing)))
-    assert "not one site is known" in [i.text for i in drawing.items if isinstance(i, Label)]
+    assert "no site is known" in [i.text for i in drawing.items if isinstance(i, Label)]
     assert shafts(drawing, width=1.2) == []
 
 
@@ -348,7 +348,7 @@ def test_check_stops_are_crosses_at_the_marks_that_are_visited_again():
     sites = {tuple(np.rint(cross / pitch).astype(int).tolist()) for cross in crosses}
     assert sites == {(0, 0), (1, -2), (-1, -2), (-1, 2), (1, 2)}
     words = [item.text for item in drawing.items if isinstance(item, Label)]
-    assert words[-1] == "crosses: check stops, seen again with the stage 20 µm off"
+    assert words[-1] == "crosses: check stops, measured again with the stage 20 µm off"
     assert not any("crosses" in item.text for item in turned(0)[0].items if isinstance(item, Label))
 
 

@@ -78,7 +78,7 @@ def test_unusable_truth_names_and_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"^truth gx: has the shape \(5, 5\)"):
         map_picture(result, {**truth, "gx": np.zeros((5, 5))})
     drawing = Drawing("a", "b", 10, 10)
-    with pytest.raises(InputError, match=r"map\.jpg: no kind of picture by its ending"):
+    with pytest.raises(InputError, match=r"map\.jpg: not a picture format by its suffix"):
         save_picture(drawing, tmp_path / "map.jpg")
     with pytest.raises(InputError, match=r"none/a\.png: cannot be written"):
         save_picture(drawing, tmp_path / "none" / "a.png")

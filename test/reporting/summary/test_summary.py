@@ -97,11 +97,11 @@ def test_state_sentence_says_what_was_found():
 def test_state_sentence_of_a_deficient_plan_names_the_missing_view():
     result = replace(known_result()[0], observability=UNSEEN)
     assert state_sentence(result) == (
-        "Not a calibration: 2 modes of the stage error cannot be seen from the marks that were "
-        "read; add a view turned by 90 deg.")
+        "Not a calibration: 2 modes of the stage error cannot be determined from the marks that "
+        "were read; add a view turned by 90 deg.")
     text = summary_text(result)
-    assert "identifiable  NO (rank 5 of 7 unknowns, 2 unseen modes)" in text
-    assert "unseen mode: scale difference" in text
+    assert "identifiable  NO (rank 5 of 7 unknowns, 2 undetermined modes)" in text
+    assert "undetermined mode: scale difference" in text
     assert "advice: add a view turned by 90 deg" in text
 
 
@@ -109,7 +109,7 @@ def test_state_sentence_without_one_known_site():
     result, _ = known_result(3, 0)
     nothing = small_map(np.full((3, 3), np.nan), np.full((3, 3), np.nan), u=np.nan)
     empty = replace(result, error_map=nothing)
-    assert state_sentence(empty) == "No calibration: not one site of the error map is known."
+    assert state_sentence(empty) == "No calibration: no site of the error map is known."
     assert "largest error      not known" in summary_text(empty)
     assert np.isnan(summary_numbers(empty)["max_error_um"])
 
