@@ -35,7 +35,7 @@ from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
 from selfcal_ros.estimation.quality.validation import judged_by, validate
 from selfcal_ros.estimation.verdict.uncertainty import budgets
-from selfcal_ros.model.artifact import with_nodes
+from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.result import (
     created_now,
     result_to_dict,

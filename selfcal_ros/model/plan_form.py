@@ -8,11 +8,10 @@ from typing import Any
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import checked_fields
-from selfcal_ros.model.artifact import (
-    Artifact,
+from selfcal_ros.model.artifact import Artifact, default_map_grid
+from selfcal_ros.model.plate_form import (
     artifact_of,
     artifact_to_dict,
-    default_map_grid,
     harmonics_of,
     map_grid_of,
     map_to_dict,

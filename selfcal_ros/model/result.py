@@ -11,14 +11,14 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
-from selfcal_ros.model.artifact import (
-    Artifact,
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.plate_form import (
     artifact_of,
     artifact_to_dict,
     map_grid_from_dict,
     map_to_dict,
 )
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import (
     BudgetLine,

@@ -11,8 +11,9 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.roughness import adequacy_of, known_places
-from selfcal_ros.model.artifact import Interpolation, MapGrid, with_nodes
+from selfcal_ros.model.artifact import Interpolation, MapGrid
 from selfcal_ros.model.plan_form import plan_from_dict
+from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded

@@ -28,7 +28,8 @@ from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import GAP, grid_residuals
 from selfcal_ros.estimation.normal.placed import PlacedEquations
 from selfcal_ros.estimation.verdict.uncertainty import Effect
-from selfcal_ros.model.artifact import Interpolation, with_nodes
+from selfcal_ros.model.artifact import Interpolation
+from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Cause
