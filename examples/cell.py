@@ -54,7 +54,8 @@ class Machine:
                                                  self._random.gauss(0, 3e-7)))
         phi, tx, ty = self._laid
         turn = view.rotation + phi
-        x, y = m * view.grid_pitch + ax, n * view.grid_pitch + ay
+        x, y = mark_place(m, n, view)
+        x, y = x + ax, y + ay
         mark_x = math.cos(turn) * x - math.sin(turn) * y + view.translation_x + tx
         mark_y = math.sin(turn) * x + math.cos(turn) * y + view.translation_y + ty
         gx, gy = self.error(*self.position[:2])
@@ -69,6 +70,12 @@ class Machine:
         return math.remainder(offset, 2 * math.pi) + self._random.gauss(0, 1e-7)
 
 
+def mark_place(m: int, n: int, view: ViewCommand) -> tuple[float, float]:
+    """Return where a mark lies on the plate, m: the rows lie evenly about its centre."""
+    nx, ny = view.grid_size, view.grid_size_y or view.grid_size  # 0: the plate is square
+    return (m + 0.5 * (nx % 2 == 0)) * view.grid_pitch, (n + 0.5 * (ny % 2 == 0)) * view.grid_pitch
+
+
 def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
     """Yield the marks (m, n) of a view with the stage position at which each is seen.
 
@@ -76,18 +83,18 @@ def grid_sites(view: ViewCommand) -> Iterator[tuple[int, int, Position]]:
     marks in the field, which is as large as the plate (one that is shifted by one pitch has a row
     less), or as the map where the command gives its nodes.
     """
-    hx = (view.grid_size - 1) // 2
-    hy = ((view.grid_size_y or view.grid_size) - 1) // 2  # 0: the plate is square
-    reach_x, reach_y = hx * view.grid_pitch, hy * view.grid_pitch
+    nx, ny = view.grid_size, view.grid_size_y or view.grid_size
+    reach_x, reach_y = ((rows - 1) / 2 * view.grid_pitch for rows in (nx, ny))
     if view.map_grid_size:
         reach_x = (view.map_grid_size - 1) / 2 * view.map_grid_pitch
         reach_y = ((view.map_grid_size_y or view.map_grid_size) - 1) / 2 * view.map_grid_pitch
     rounding = 1e-9 * view.grid_pitch
     cosine, sine = math.cos(view.rotation), math.sin(view.rotation)
-    for m in range(-hx, hx + 1):
-        for n in range(-hy, hy + 1):
-            x = (cosine * m - sine * n) * view.grid_pitch + view.translation_x
-            y = (sine * m + cosine * n) * view.grid_pitch + view.translation_y
+    for m in range(-(nx // 2), nx - nx // 2):
+        for n in range(-(ny // 2), ny - ny // 2):
+            u, v = mark_place(m, n, view)
+            x = cosine * u - sine * v + view.translation_x
+            y = sine * u + cosine * v + view.translation_y
             if abs(x) <= reach_x + rounding and abs(y) <= reach_y + rounding:
                 yield m, n, (x, y, 0.0)
 

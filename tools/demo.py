@@ -66,7 +66,7 @@ def map_picture(emap: "ErrorMap") -> list[str]:
 
     artifact = emap.artifact
     step = max(1, -(-max(artifact.shape) // MOST))
-    sites = tuple(slice(half % step, None, step) for half in artifact.half)
+    sites = tuple(slice(at % step, None, step) for at in artifact.middle)
     length = np.hypot(emap.gx, emap.gy)[sites] * UM_PER_M
     known = np.isfinite(length)
     most = float(length[known].max()) if known.any() else 0.0

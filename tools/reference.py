@@ -48,7 +48,7 @@ PLAN = {
     "map": "nodes of the error map where they are not the sites of the plate's lattice "
            "(docs/identifiability.md); default: those sites, or for views off the lattice three "
            "quarters as many nodes as marks over the same field",
-    "map.grid_size": "nodes along x; odd",
+    "map.grid_size": "nodes along x, from 3",
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
     "map.harmonics": "harmonics of the angular map, fewer than half the lines: a Fourier series, "
@@ -59,7 +59,7 @@ PLAN = {
     "image.nx": "marks along stage x, odd; the middle one is on the optical axis",
     "image.ny": "marks along stage y, odd",
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
-    "artifact.grid_size": "N, marks along x; odd, 3 to 1001",
+    "artifact.grid_size": "N, marks along x, 3 to 1001; or [along x, along y]",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines, at least 3; 0 without lines",
     "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
@@ -96,9 +96,9 @@ RESULT = {
     "coverage_factor": "k for 95.45 % at those degrees of freedom: xy, theta",
     "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
              "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of the readings)",
-    "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] = site m = i − h, n = j − h, null "
-                 "where unknown; g_theta, u_g_theta: K numbers in rad; nonorthogonality, "
-                 "scale_difference, datum_theta",
+    "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] at x = (i − (N−1)/2) pitches and y "
+                 "likewise, null where unknown; g_theta, u_g_theta: K numbers in rad; "
+                 "nonorthogonality, scale_difference, datum_theta",
     "artifact_map": "ax, ay, u_ax, u_ay (m), a_theta, u_a_theta (rad) of the plate, as error_map; "
                     "u_a_theta with the θ datum zero_mean, no u of the plate by Hu's law",
     "observability": "rank, unknowns, deficiency, identifiable, modes, advice; unchecked_sites, "

@@ -202,6 +202,7 @@ def map_line(error_map: ErrorMap, along: Literal["x", "y"],
              corrected: Literal["x", "y"]) -> AxisCorrection:
     """Return the correction +G of `corrected` along the middle line of an error map.
 
+    Between an even number of lines that is the mean of the two in the middle.
     `along` equal to `corrected` is accuracy, else straightness.
 
     Raises
@@ -210,13 +211,13 @@ def map_line(error_map: ErrorMap, along: Literal["x", "y"],
         If a site on the line is unknown.
     """
     artifact = error_map.artifact
-    hx, hy = artifact.half
-    line = (slice(None), hy) if along == "x" else (hx, slice(None))
-    values = (error_map.gx if corrected == "x" else error_map.gy)[line]
+    across, positions = (1, artifact.x_m[:, 0]) if along == "x" else (0, artifact.y_m[0])
+    field, size = error_map.gx if corrected == "x" else error_map.gy, artifact.shape[across]
+    values = (field.take((size - 1) // 2, across) + field.take(size // 2, across)) / 2
     if not np.isfinite(values).all():
         raise InputError("error map", f"{int(np.isnan(values).sum())} sites on its {along} axis "
                          "are unknown", "measure them")
-    return AxisCorrection((artifact.x_m if along == "x" else artifact.y_m)[line], values)
+    return AxisCorrection(positions, values)
 
 
 def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorrection:

@@ -48,12 +48,11 @@ def run(args: argparse.Namespace) -> int:
 def csv_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
     emap, plate = result.error_map, result.artifact
-    rows = [",".join(COLUMNS)]
-    pitch = plate.grid_pitch_m
+    rows, x_m, y_m = [",".join(COLUMNS)], plate.x_m, plate.y_m
     for i, j in ((i, j) for i in range(plate.shape[0]) for j in range(plate.shape[1])):
-        m, n = i - plate.half[0], j - plate.half[1]
-        cells = [m, n, m * pitch, n * pitch, emap.gx[i, j], emap.gy[i, j], emap.u_gx[i, j],
-                 emap.u_gy[i, j]]
+        m, n = i - plate.middle[0], j - plate.middle[1]
+        cells = [m, n, *(float(part[i, j]) for part in (
+            x_m, y_m, emap.gx, emap.gy, emap.u_gx, emap.u_gy))]
         rows.append(",".join([*map(_cell, cells), "", "", "", ""]))
     for k in range(plate.angular_count):
         cells = [k, 2 * math.pi * k / plate.angular_count, emap.g_theta[k], emap.u_g_theta[k]]
@@ -66,7 +65,7 @@ def _cell(value: float) -> str:
 
 
 def npz_bytes(result: "CalibrationResult") -> bytes:
-    """Return the maps as arrays by the names of RESULT.json, [i, j] = site m = i - h, n = j - h."""
+    """Return the maps as arrays by the names of RESULT.json, [i, j] = site i - Nx//2, j - Ny//2."""
     emap, plate = result.error_map, result.artifact
     out, found = io.BytesIO(), result.plate.marks
     marks = {} if found is None else {

@@ -71,8 +71,8 @@ def _missing_stops(artifact: Artifact, view: View, readings: ViewReadings,
     stops = np.zeros(artifact.shape, dtype=bool)
     for marks, part in zip(marks_shown(artifact, view), readings.cells, strict=True):
         stops |= beside(marks & ~_read(artifact, part, min_repeats), artifact, part.view, -1)
-    m, n = np.nonzero(stops)
-    return m[:NAMED_AT_MOST] - artifact.half[0], n[:NAMED_AT_MOST] - artifact.half[1]
+    i, j = np.nonzero(stops)
+    return artifact.marks_at(i[:NAMED_AT_MOST], j[:NAMED_AT_MOST])
 
 
 def read_enough(view: View, readings: ViewReadings,

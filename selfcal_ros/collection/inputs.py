@@ -178,8 +178,8 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     readings.view.on_stage(artifact)
     limits = [("k", readings.k, 0, artifact.angular_count - 1)]
     if artifact.marks is None:
-        limits[:0] = [(name, index, -half, half) for name, index, half in zip(
-            "mn", (readings.m, readings.n), artifact.half, strict=True)]
+        limits[:0] = [(name, index, *ends) for name, index, ends in zip(
+            "mn", (readings.m, readings.n), artifact.limits, strict=True)]
     elif not artifact.has(readings.m, readings.n).all():
         raise InputError(where, "an id that is not in the list of marks", "correct the publisher")
     for name, index, least, most in limits:

@@ -234,9 +234,9 @@ def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndar
         return found, number
     offset = np.stack([d["ox"], d["oy"]])
     named = d["has_id"] & (found.reasons != Reason.UNKNOWN_MARK)
-    site = np.stack(view.on_stage(artifact).site_of(d["m"][named], d["n"][named]))
+    marks = artifact.places(d["m"][named], d["n"][named])
     away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
-    away -= site * artifact.grid_pitch_m
+    away -= np.stack(view.on_stage(artifact).site_of(*marks)) * artifact.grid_pitch_m
     plate = 0j if named.any() else displacement(
         artifact, view, found.rigid, _reading(rules.sense, position, offset))
     tried = _identified_at(artifact, view, d, position, rules, plate=plate,
@@ -258,7 +258,7 @@ def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.nda
     """Return by how many whole pitches marks without ids lie beside the plate, stage frame."""
     pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
-    on_plate = np.rint(np.stack(pose.turned_back(*(rigid.undo(centred) / pitch))))
+    on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
     beside = (stops.middle_of(row, side) for row, side in zip(
         on_plate, artifact.shape, strict=True))
     x, y = pose.turned(*(np.array([float(number)]) for number in beside))

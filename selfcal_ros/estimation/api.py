@@ -137,14 +137,14 @@ def pure_noise(marks: int) -> Measurements:
     Parameters
     ----------
     marks : int
-        Marks along each side of the plate, odd.
+        Marks along each side of the plate.
     """
     plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
     lines, views = np.arange(plate.angular_count), []
     for number, view in enumerate((
             View("identity"), View("rot90", np.pi / 2), View("line", np.pi / 4, grid=False),
             View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)))):
-        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.half[0])
+        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
         m, n = plate.m[on_field], plate.n[on_field]
         dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
         once, mark = np.ones(len(m), dtype=int), np.arange(len(m))

@@ -106,8 +106,8 @@ class ReferenceLength:
         for mark in marks:
             if not artifact.has(*map(np.array, mark)):
                 known = "write the ids of marks in its list" if artifact.marks else (
-                    f"its marks go from (-{artifact.half[0]}, -{artifact.half[1]}) to "
-                    f"{artifact.half}")
+                    "its marks go from ({}, {}) to ({}, {})".format(
+                        *(end for ends in zip(*artifact.limits, strict=True) for end in ends)))
                 raise InputError(where, f"the plate has no mark {mark}", known)
         nominal = artifact.grid_pitch_m * math.dist(*(
             tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks))

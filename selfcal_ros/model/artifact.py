@@ -34,7 +34,7 @@ class MapGrid:
     Attributes
     ----------
     size : int
-        Number of nodes along x; odd. The map is square unless `size_y` is given.
+        Number of nodes along x. The map is square unless `size_y` is given.
     pitch_m : float
         Distance between neighbouring nodes, m.
     interpolation : Interpolation
@@ -53,13 +53,15 @@ class MapGrid:
 class Artifact:
     """Nominal geometry of the plate, and the grid of the stage's map.
 
-    Unless `map_grid` is given, the map has its nodes on the plate's lattice. The marks of a list
-    are arrays (n, 1): n rows of one mark, m the ids, n = 0.
+    The marks of a lattice lie evenly about its centre: along a side with an odd number of them mark
+    m at m pitches, m from -(N-1)/2 to (N-1)/2; along one with an even number at m + 1/2 pitches, m
+    from -N/2 to N/2 - 1. Unless `map_grid` is given, the map has its nodes on the plate's lattice.
+    The marks of a list are arrays (n, 1): n rows of one mark, m the ids, n = 0.
 
     Attributes
     ----------
     grid_size : int
-        N, number of marks along x; odd. The plate is square unless `grid_size_y` is given.
+        N, number of marks along x. The plate is square unless `grid_size_y` is given.
     grid_pitch_m : float
         Distance between neighbouring marks, m.
     angular_count : int
@@ -79,8 +81,8 @@ class Artifact:
     Raises
     ------
     InputError
-        If a size is even, a size or the pitch is out of range, K is 1, 2 or negative, or the lines
-        do not determine H harmonics.
+        If a size or the pitch is out of range, K is 1, 2 or negative, or the lines do not determine
+        H harmonics.
     """
 
     grid_size: int
@@ -92,17 +94,17 @@ class Artifact:
     marks: MarkList | None = None
 
     def __post_init__(self) -> None:
-        """Refuse sizes without a centre mark and counts without a quarter turn."""
+        """Refuse impossible sizes, pitches and counts."""
         if self.marks is not None:
             for name, value in (("grid_size", len(self.marks.ids)), ("grid_size_y", 1),
                                 ("grid_pitch_m", self.marks.spacing_m)):
                 object.__setattr__(self, name, value)
         sides = ("grid_size", self.grid_size), ("grid_size_y", self.shape[1])
         for name, size in () if self.marks else sides:
-            if not 3 <= size <= MAX_GRID_SIZE or size % 2 == 0:
-                raise InputError(f"artifact {name}", f"{size} is not an odd number from 3 to "
-                                 f"{MAX_GRID_SIZE}", "give an odd number of rows, or a lattice "
-                                 "of even sides as a list (artifact: {marks: FILE.csv})")
+            if not 3 <= size <= MAX_GRID_SIZE:
+                raise InputError(f"artifact {name}", f"{size} is not a number from 3 to "
+                                 f"{MAX_GRID_SIZE}", "give the number of rows; marks in fewer rows "
+                                 "as a list (artifact: {marks: FILE.csv})")
         if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
                              "give the distance between marks in metres")
@@ -123,7 +125,7 @@ class Artifact:
                 Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
             except InputError as error:
                 raise InputError(error.where.replace("artifact", "map"), error.what,
-                                 "give the map an odd number of nodes, its pitch in m") from error
+                                 "give the number of nodes a side, their pitch in m") from error
 
     @cached_property
     def field(self) -> "Artifact":
@@ -152,8 +154,8 @@ class Artifact:
         return self.grid_size, self.grid_size_y or self.grid_size
 
     @property
-    def half(self) -> tuple[int, int]:
-        """Largest index along x and y of a lattice: h = (N-1)/2.
+    def half(self) -> tuple[float, float]:
+        """Largest x and y of a lattice, pitches: h = (N-1)/2, whole numbers on odd sides.
 
         Raises
         ------
@@ -162,7 +164,34 @@ class Artifact:
         """
         if self.marks is not None:
             raise ValueError("a list of marks has no rows")
-        return self.shape[0] // 2, self.shape[1] // 2  # both are odd
+        hx, hy = (size // 2 if size % 2 else (size - 1) / 2 for size in self.shape)
+        return hx, hy
+
+    @property
+    def limits(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Smallest and largest m, and n, of a lattice."""
+        (nx, ny), (i, j) = self.shape, self.middle
+        return (-i, nx - i - 1), (-j, ny - j - 1)
+
+    @property
+    def middle(self) -> tuple[int, int]:
+        """Index in arrays (nx, ny) of the mark m = n = 0 of a lattice."""
+        return self.shape[0] // 2, self.shape[1] // 2
+
+    @property
+    def off_centre(self) -> tuple[float, float]:
+        """Place of the mark m = n = 0 of a lattice along x and y, pitches: 1/2 on even sides."""
+        return 0.5 * (self.shape[0] % 2 == 0), 0.5 * (self.shape[1] % 2 == 0)
+
+    @property
+    def quarter_shift(self) -> float:
+        """Shift along x and y, pitches, of a plate that lies on its lattice after a quarter turn.
+
+        Half a pitch, more or less by whole ones, if one side has an odd and the other an even
+        number of marks: without it rows would lie between rows. Else 0.
+        """
+        nx, ny = self.shape
+        return 0.5 if (nx - ny) % 2 and self.marks is None and self.map_grid is None else 0
 
     @cached_property
     def reach(self) -> tuple[float, float]:
@@ -177,33 +206,38 @@ class Artifact:
         """Index m of every site, int array (nx, ny)."""
         if self.marks is not None:
             return self.marks.id_array[:, None]
-        return np.repeat(np.arange(self.shape[0])[:, None] - self.half[0], self.shape[1], axis=1)
+        return np.repeat(np.arange(self.shape[0])[:, None] - self.middle[0], self.shape[1], axis=1)
 
     @cached_property
     def n(self) -> np.ndarray:
         """Index n of every site, int array (nx, ny)."""
         if self.marks is not None:
             return np.zeros(self.shape, dtype=int)
-        return np.repeat(np.arange(self.shape[1])[None, :] - self.half[1], self.shape[0], axis=0)
+        return np.repeat(np.arange(self.shape[1])[None, :] - self.middle[1], self.shape[0], axis=0)
 
     def has(self, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return which of the marks (m, n) are on the plate, bool."""
         if self.marks is not None:
             return np.isin(m, self.marks.id_array) & (np.asarray(n) == 0)
-        hx, hy = self.half
-        return (np.maximum(m, -m) <= hx) & (np.maximum(n, -n) <= hy)
+        (first_m, last_m), (first_n, last_n) = self.limits
+        return (m >= first_m) & (m <= last_m) & (n >= first_n) & (n <= last_n)
 
     def index(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices of marks of the plate in arrays (nx, ny)."""
         if self.marks is not None:
             return np.searchsorted(self.marks.id_array, m), np.zeros_like(n)
-        return m + self.half[0], n + self.half[1]
+        return m + self.middle[0], n + self.middle[1]
 
     def marks_at(self, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return m and n of the marks with these indices in arrays (nx, ny)."""
         if self.marks is not None:
             return self.marks.id_array[i], np.zeros_like(j)
-        return i - self.half[0], j - self.half[1]
+        return i - self.middle[0], j - self.middle[1]
+
+    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return m and n, floats, of a lattice without an edge nearest to places in pitches."""
+        off_m, off_n = self.off_centre
+        return np.rint(x - off_m), np.rint(y - off_n)
 
     def flat(self, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return the indices of marks of the plate in flattened arrays."""
@@ -211,9 +245,10 @@ class Artifact:
         return i * self.shape[1] + j
 
     def places(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nominal places of marks on the plate, in pitches: on a lattice (m, n)."""
+        """Return the nominal places of marks on the plate, in pitches: (m, n) between odd sides."""
         if self.marks is None:
-            return m, n
+            off_m, off_n = self.off_centre
+            return m + off_m if off_m else m, n + off_n if off_n else n
         x, y = self.marks.places_m[:, self.index(m, n)[0]] / self.grid_pitch_m
         return x, y
 
@@ -222,14 +257,14 @@ class Artifact:
         """Nominal x of every site in m, (nx, ny)."""
         if self.marks is not None:
             return self.marks.places_m[0][:, None]
-        return self.m * self.grid_pitch_m
+        return self.places(self.m, self.n)[0] * self.grid_pitch_m
 
     @property
     def y_m(self) -> np.ndarray:
         """Nominal y of every site in m, (nx, ny)."""
         if self.marks is not None:
             return self.marks.places_m[1][:, None]
-        return self.n * self.grid_pitch_m
+        return self.places(self.m, self.n)[1] * self.grid_pitch_m
 
     @property
     def theta_rad(self) -> np.ndarray:
@@ -259,7 +294,7 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
                              "choose the nodes of the map", "give them in the plan, e.g. "
                              "map: {grid_size: 3}, or use a plate with more marks")
     else:
-        cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer)))
+        cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer) // 2 * 2))
     cells = min(cells, DEFAULT_NODES - 1)
     pitch_m = 2 * longer * artifact.grid_pitch_m / cells
     sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.reach]

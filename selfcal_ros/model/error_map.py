@@ -41,7 +41,7 @@ class ErrorMap:
     artifact : Artifact
         Lattice of the sites.
     gx, gy : float array (nx, ny)
-        Error at site m = i - hx, n = j - hy, m; NaN where unknown.
+        Error at site m = i - Nx//2, n = j - Ny//2, m; NaN where unknown.
     u_gx, u_gy : float array (nx, ny)
         Standard uncertainties (k=1), m.
     g_theta, u_g_theta : float array (K,)
@@ -104,7 +104,8 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     """Return the slopes of the XY error along the half axes +X, +Y, -X, -Y, rad (Hu eq. 27).
 
     They are the angular errors at lines 0, K/4, K/2, 3K/4: ordinary least squares with
-    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN if a half axis has only one site.
+    intercept; +Gy on x along +-X, -Gx on y along +-Y. NaN if a half axis has only one site, or
+    none: along a side with an even number of sites no site lies on the other axis.
 
     Parameters
     ----------
@@ -113,7 +114,9 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     g_m : float array (2, nx, ny, ...)
         XY error, m; further axes are kept.
     """
-    hx, hy = artifact.half
+    if not all(size % 2 for size in artifact.shape):
+        return np.full((4, *g_m.shape[3:]), np.nan)
+    hx, hy = artifact.middle
     along = (g_m[1, hx + 1:, hy], -g_m[0, hx, hy + 1:], g_m[1, :hx, hy], -g_m[0, hx, :hy])
     return np.stack([_slope(line, artifact.grid_pitch_m) for line in along])
 

@@ -51,7 +51,8 @@ def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
         raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
                          f"use one of {', '.join(Interpolation)}")
     sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
-    spans = max(half / max(size // 2, 1) for half, size in zip(artifact.reach, sizes, strict=True))
+    spans = max(2 * half / max(size - 1, 1) for half, size in zip(
+        artifact.reach, sizes, strict=True))
     return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
                    Interpolation(raw["interpolation"]), raw["grid_size_y"])
 
@@ -62,8 +63,9 @@ def artifact_of(data: dict, where: str) -> Artifact:
     Parameters
     ----------
     data : dict
-        ``grid_size``, ``grid_pitch`` (m), ``angular_count`` and optionally ``grid_size_y``; or
-        ``marks {id, x, y}``, lists (m), and optionally ``angular_count``.
+        ``grid_size`` (a number or [along x, along y]), ``grid_pitch`` (m), ``angular_count`` and
+        optionally ``grid_size_y``; or ``marks {id, x, y}``, lists (m), and optionally
+        ``angular_count``.
     where : str
         File name and key, for messages.
 
@@ -83,9 +85,20 @@ def artifact_of(data: dict, where: str) -> Artifact:
                              "give each mark a whole id, x and y in m")
         return Artifact(0, 0.0, raw["angular_count"], marks=marks_of(
             lists["id"], lists["x"], lists["y"]))
-    raw = checked_fields(data, where, {"grid_size": int, "grid_pitch": float,
-                                       "angular_count": int}, {"grid_size_y": (int, 0)})
+    raw = checked_fields(_with_sides(data, where), where, {
+        "grid_size": int, "grid_pitch": float, "angular_count": int}, {"grid_size_y": (int, 0)})
     return Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"])
+
+
+def _with_sides(data: dict, where: str) -> dict:
+    """Return a mapping with ``grid_size_y`` instead of a ``grid_size`` of two numbers."""
+    sides = data.get("grid_size") if isinstance(data, dict) else None
+    if not isinstance(sides, list):
+        return data
+    if len(sides) != 2 or "grid_size_y" in data or not all(type(size) is int for size in sides):
+        raise InputError(f"{where}: grid_size", f"{sides!r} is no number of marks along x and y",
+                         "give [8, 6], or grid_size and grid_size_y")
+    return data | {"grid_size": sides[0], "grid_size_y": sides[1] if sides[1] != sides[0] else 0}
 
 
 def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
@@ -102,9 +115,9 @@ def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
 def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
     """Return the plate with a map of NODES[:INTERPOLATION] over the same field."""
     size, _, interpolation = text.partition(":")
-    if not (size.isdecimal() and int(size) >= 3 and int(size) % 2):
+    if not (size.isdecimal() and int(size) >= 3):
         raise InputError(where, f"'{text}' is not NODES[:INTERPOLATION]",
-                         "give an odd number of nodes a side from 3 on, e.g. 9:bicubic")
+                         "give a number of nodes a side from 3 on, e.g. 9:bicubic")
     given = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
     field = artifact.field
     if field.half[0] == field.half[1]:

@@ -23,7 +23,7 @@ EDGE = 1e-9
 
 
 class StagePose(ABC):
-    """A pose of the plate in pitches: of a site (x, y) on the stage, of a mark (m, n) on the plate.
+    """A pose of the plate in pitches: of a site (x, y) on the stage, of a place on the plate.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class StagePose(ABC):
         """Turn of the plate, counter-clockwise, 0 to 360 deg."""
 
     @abstractmethod
-    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def turned(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the plate frame in the stage frame."""
 
     @abstractmethod
@@ -71,15 +71,15 @@ class StagePose(ABC):
             raise ValueError("the turn is counted in lines only on a plate with angular lines")
         return self.turn_lines
 
-    def site_of(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the site (x, y) of a place (m, n) on the plate, pitches: R (m, n) + shift.
+    def site_of(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the site (x, y) of a place (u, v) on the plate, pitches: R (u, v) + shift.
 
         Raises
         ------
         ValueError
             On the lattice, if the turn is not a whole quarter.
         """
-        x, y = self.turned(m, n)
+        x, y = self.turned(u, v)
         return x + self.shift[0], y + self.shift[1]
 
     def marks_in_field(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
@@ -103,13 +103,14 @@ class LatticePose(StagePose):
     quarter_turns : int or None
         q in 0..3, counter-clockwise; None if the turn is not a whole quarter.
     shift : tuple of int
-        (a, b), translation along stage x and y in pitches.
+        (a, b), translation along stage x and y in pitches. Odd multiples of 1/2 for a quarter turn
+        of a plate with an odd and an even number of marks along its sides.
     turn_lines : int or None
         s in 0..K-1, the total turn in angular lines; None on a plate without lines.
     """
 
     quarter_turns: int | None
-    shift: tuple[int, int]
+    shift: tuple[float, float]
     turn_lines: float | None
 
     @property
@@ -136,18 +137,18 @@ class LatticePose(StagePose):
         return (1, 1j, -1, -1j)[self.q]
 
     @property
-    def a(self) -> int:
+    def a(self) -> float:
         """Shift along stage x, pitches."""
         return self.shift[0]
 
     @property
-    def b(self) -> int:
+    def b(self) -> float:
         """Shift along stage y, pitches."""
         return self.shift[1]
 
-    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a vector of the plate frame in the stage frame: R^q (m, n)."""
-        return ((m, n), (-n, m), (-m, -n), (n, -m))[self.q]
+    def turned(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a vector of the plate frame in the stage frame: R^q (u, v)."""
+        return ((u, v), (-v, u), (-u, -v), (v, -u))[self.q]
 
     def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the stage frame in the plate frame: R^-q (x, y)."""
@@ -161,12 +162,13 @@ class LatticePose(StagePose):
     def mark_rows(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
         """Return the first n in the field for each m, and the number of marks, int arrays (nx,)."""
         hx, hy = artifact.half
-        x, y = (-hx - self.a, hx - self.a), (-hy - self.b, hy - self.b)  # of R^q (m, n)
+        x, y = (-hx - self.a, hx - self.a), (-hy - self.b, hy - self.b)  # of R^q (u, v)
         minus_x, minus_y = (-x[1], -x[0]), (-y[1], -y[0])
-        m, n = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[self.q]
-        first, row = max(n[0], -hy), np.arange(-hx, hx + 1)
-        count = max(min(n[1], hy) - first + 1, 0)
-        return np.full(len(row), first), np.where((row >= m[0]) & (row <= m[1]), count, 0)
+        u, v = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[self.q]
+        first, row = max(v[0], -hy), np.arange(artifact.shape[0]) - hx
+        count = int(max(min(v[1], hy) - first + 1, 0))
+        n = int(first - artifact.off_centre[1])
+        return np.full(len(row), n), np.where((row >= u[0]) & (row <= u[1]), count, 0)
 
 
 @dataclass(frozen=True)
@@ -190,10 +192,10 @@ class PlacedPose(StagePose):
         """Turn of the plate, counter-clockwise, 0 to 360 deg."""
         return round(math.degrees(cmath.phase(self.phase)), 6) % 360
 
-    def turned(self, m: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def turned(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the plate frame in the stage frame."""
         cosine, sine = self.phase.real, self.phase.imag
-        return cosine * m - sine * n, sine * m + cosine * n
+        return cosine * u - sine * v, sine * u + cosine * v
 
     def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the stage frame in the plate frame."""

@@ -196,9 +196,10 @@ class View:
             If the pose is off the lattice, or grid marks are requested at a turn that is
             not a whole quarter.
         """
-        where = f"view '{self.name}'"
-        a, b = (whole_steps(step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
-                for step in self._pitches(artifact))
+        where, beside = f"view '{self.name}'", self._beside(artifact)
+        a, b = (self._half_steps(step, artifact) if beside else whole_steps(
+            step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
+            for step in self._pitches(artifact))
         quarter = nearest_step(self.rotation_rad / (math.pi / 2))
         if self.grid and quarter is None:
             raise InputError(where, f"grid marks cannot be measured at a turn of "
@@ -216,8 +217,24 @@ class View:
         """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
         if artifact.marks is not None:
             return False
-        steps = (*self._pitches(artifact), self.rotation_rad / (math.pi / 2))
+        turn, beside = self.rotation_rad / (math.pi / 2), self._beside(artifact)
+        steps = (*(step - beside for step in self._pitches(artifact)), turn)
         return not self.grid or all(nearest_step(step) is not None for step in steps)
+
+    def _beside(self, artifact: Artifact) -> float:
+        """Return by how much more than whole pitches the plate is shifted on its lattice."""
+        quarter = nearest_step(self.rotation_rad / (math.pi / 2))
+        return artifact.quarter_shift if self.grid and quarter is not None and quarter % 2 else 0
+
+    def _half_steps(self, step: float, artifact: Artifact) -> float:
+        """Return the odd multiple of 1/2 that a translation in pitches is meant to be."""
+        whole = nearest_step(step - 0.5)
+        if whole is None:
+            nx, ny = artifact.shape
+            raise InputError(f"view '{self.name}' translation", f"after a quarter turn the rows of "
+                             f"{nx} x {ny} marks lie between rows at a shift of {step:.6g} pitch",
+                             f"shift it by [0.5, 0.5] pitch to place it on the {OFF}")
+        return whole + 0.5
 
     def _pitches(self, artifact: Artifact) -> tuple[float, float]:
         """Return the translation in pitches; InputError unless the pose is finite."""

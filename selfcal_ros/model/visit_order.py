@@ -86,18 +86,22 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     n_passes = 1 if consecutive else view.repeats
     of_plate = chosen.of_plate or artifact.map_grid is not None  # no lines of sites off the lattice
     places = np.stack(artifact.places(*marks)) if of_plate else sites
-    passes = _passes(chosen, places, n_passes, rng)
+    lines = np.rint(places) if artifact.marks else places  # of a list: one pitch wide
+    passes = _passes(chosen, places, lines, n_passes=n_passes, rng=rng)
     return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
 
 
-def _passes(order: VisitOrder, places: np.ndarray, n_passes: int,
+def _passes(order: VisitOrder, places: np.ndarray, lines: np.ndarray, *, n_passes: int,
             rng: np.random.Generator | None) -> np.ndarray:
-    """Return the indices of `places` (2, n) in the order of their visits, (passes, n)."""
+    """Return the indices of `places` (2, n) in the order of their visits, (passes, n).
+
+    `lines` (2, n): their row and column.
+    """
     if order.name == "random":
         if rng is None:
             raise ValueError("a random visiting order needs a source of chance")
         return np.stack([rng.permutation(places.shape[1]) for _ in range(n_passes)])
-    (x, y), (row, column) = places, np.rint(places)  # marks of a list: lines one pitch wide
+    (x, y), (row, column) = places, lines
     # line by line along x: each line runs along y
     along_x, along_y = np.lexsort((y, row)), np.lexsort((x, column))
     cycle = {"raster": (along_x,),

@@ -61,11 +61,11 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     artifact = error_map.artifact
     step = math.ceil(max(artifact.shape) / MOST_SITES)
     spacing = step * artifact.grid_pitch_m
-    m, n = (np.arange(-half, half + 1) for half in artifact.half)
+    m, n = artifact.m[:, 0], artifact.n[0]
     shown = error_map.valid & ((m % step == 0)[:, None] & (n % step == 0)[None, :])
-    i, j = np.nonzero(shown)
-    sites = np.column_stack((m[i], n[j], np.zeros(len(i)))) * artifact.grid_pitch_m
-    errors = np.column_stack((error_map.gx[shown], error_map.gy[shown], np.zeros(len(i))))
+    x, y, zero = artifact.x_m[shown], artifact.y_m[shown], np.zeros(np.count_nonzero(shown))
+    sites = np.column_stack((x, y, zero))
+    errors = np.column_stack((error_map.gx[shown], error_map.gy[shown], zero))
     longest = float(np.linalg.norm(errors, axis=1).max(initial=0.0))
     factor = enlargement(spacing, longest)
     ends = np.stack((sites, sites + factor * errors), axis=1).reshape(-1, 3)

@@ -29,7 +29,7 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     inside = ~pose.beyond_field(sites, artifact)
     out, stop = np.full_like(site, np.nan), sign * site[:, inside]
     if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
-        i, j = np.rint(stop / artifact.grid_pitch_m).astype(int) + np.array(artifact.half)[:, None]
+        i, j = np.rint(stop / artifact.grid_pitch_m + np.array(artifact.half)[:, None]).astype(int)
         error = truth.g[:, i, j] + physics.stage_bending(truth, stop, index)
     else:
         error = physics.stage_error(truth, stop, index)

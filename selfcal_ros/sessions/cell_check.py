@@ -51,8 +51,9 @@ class CheckItem:
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
     """Return the middle of a plan's plate, and its view: straight, with check stops."""
     plate, listed = plan.artifact, plan.artifact.marks
+    nx, ny = (MARKS + 1 - size % 2 for size in plate.shape)  # about the same centre
     plate = (replace(plate, marks=listed.innermost(MARKS**2)) if listed else
-             Artifact(MARKS, plate.grid_pitch_m, plate.angular_count))
+             Artifact(nx, plate.grid_pitch_m, plate.angular_count, 0 if nx == ny else ny))
     marks = next((view for view in plan.views if view.check_marks), View(""))
     offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
     angular = plate.angular_count > 0 and any(view.angular for view in plan.views)

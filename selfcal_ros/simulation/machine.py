@@ -330,7 +330,7 @@ def _stage(artifact: Artifact, spread: Spread,
     # directions and lengths with the spectrum of exp(-d^2 / 2 L^2)
     number = rng.normal(0, 1 / length, (N_WAVES, 2))
     waves = Waves(number, _amplitudes(rng, np.full(N_WAVES, spread.g_m / np.sqrt(N_WAVES)), 2))
-    sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+    sites = np.stack(artifact.places(artifact.m.ravel(), artifact.n.ravel()))
     return waves.at(sites).reshape(2, *artifact.shape), waves
 
 

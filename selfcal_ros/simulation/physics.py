@@ -66,9 +66,8 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
         away, near = artifact.marks.tree.query(np.stack(place, axis=1) * artifact.grid_pitch_m)
         return (artifact.marks.id_array[near], np.zeros(len(near), dtype=int),
                 away < artifact.grid_pitch_m / 2)
-    m, n = np.rint(place).astype(int)
-    hx, hy = artifact.half
-    there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
+    m, n = np.stack(artifact.nearest(*place)).astype(int)
+    there = artifact.has(m, n)
     return m * there, n * there, there
 
 
@@ -82,8 +81,7 @@ def marks_beside(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, 
     step = np.conj(lies.pose.phase) * sub_view.cell_m / truth.artifact.grid_pitch_m
     m, n = (at + np.rint(part).astype(int) for at, part in zip(
         marks, (step.real, step.imag), strict=True))
-    hx, hy = truth.artifact.half
-    there = (np.abs(m) <= hx) & (np.abs(n) <= hy)
+    there = truth.artifact.has(m, n)
     return m * there, n * there, there
 
 
@@ -184,7 +182,7 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
     artifact = truth.artifact.lattice
     place, g = position / artifact.grid_pitch_m, truth.g
     if len(truth.waves.number):
-        sites = np.stack([artifact.m.ravel(), artifact.n.ravel()])
+        sites = np.stack(artifact.places(*all_marks(artifact)))
         g = g - truth.waves.at(sites).reshape(g.shape)
     error = between_sites(artifact, g, position) + stage_bending(truth, position, index)
     return error + truth.waves.at(place) if len(truth.waves.number) else error

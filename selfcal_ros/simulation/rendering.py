@@ -230,8 +230,8 @@ def exposures(truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event],
     if truth.artifact.marks:
         raise InputError("camera", "images are rendered of lattices, the plate is a list of marks",
                          "simulate detections instead")
-    (hx, hy), reach = truth.artifact.half, camera.reach_m
-    m, n = (side.ravel() for side in np.mgrid[-hx:hx + 1, -hy:hy + 1])
+    artifact, reach = truth.artifact, camera.reach_m
+    (m, n), (i, j) = physics.all_marks(artifact), artifact.middle
     place, index, angle = np.zeros((2, 0)), -1, 0.0
     for _, group in groupby(events, key=lambda event: (event.stamp_ns, _is_grid(event))):
         found = list(group)
@@ -241,7 +241,7 @@ def exposures(truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event],
                 view = truth.placed_as(index, event.view)
                 place, _ = physics.mark_places(truth, index, view, (m, n))
                 angle = float(view.rotation_rad + truth.phi_rad[index])
-        seen = {(event.m + hx) * (2 * hy + 1) + event.n + hy: (event.offset_x, event.offset_y)
+        seen = {(event.m + i) * artifact.shape[1] + event.n + j: (event.offset_x, event.offset_y)
                 for event in found if isinstance(event, Detection) and _is_grid(event)}
         if not seen:
             yield from found

@@ -131,14 +131,17 @@ def _groups(view: ViewReadings, measurements: Measurements, axis: int,
     visits = view.visits
     if visits is None or not len(visits.mark):
         return
-    x, y = view.view.lattice_pose(measurements.artifact).site_of(view.m, view.n)
+    artifact = measurements.artifact
+    pose, off = view.view.lattice_pose(artifact), artifact.off_centre
+    x, y = pose.site_of(*artifact.places(view.m, view.n))
     values = sign * (visits.dx, visits.dy)[axis]
     approach = (visits.approach_x, visits.approach_y)[axis]
     order = np.argsort(visits.mark, kind="stable")
     starts = np.flatnonzero(np.diff(visits.mark[order], prepend=-1))
     for rows in np.split(order, starts[1:]):
         mark = visits.mark[rows[0]]
-        yield (sign * int(x[mark]), sign * int(y[mark])), (values[rows], approach[rows])
+        site = int(sign * x[mark] - off[0]), int(sign * y[mark] - off[1])
+        yield site, (values[rows], approach[rows])
 
 
 def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
@@ -200,7 +203,8 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     stage : StageMap
         The map.
     axis, line : int
-        0 = x, 1 = y; index of the line, 0 = through the centre of the field.
+        0 = x, 1 = y; index of the line, 0 = through the centre of the field, or half a pitch
+        beside it between an even number of lines.
     repeats : dict, optional
         As `scatters` returns; None = figures of the mean deviation alone.
     approach_in_model : bool
@@ -213,18 +217,17 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     """
     known = _positions(stage, axis, line, repeats)
     at, emap = stage.error_map.artifact, stage.error_map
-    index = np.array(known) + at.half
-    place = index[:, 0], index[:, 1]
+    place = at.index(*np.array(known).T)
     error = (emap.gx, emap.gy)[axis][place]
     drawn = error + _map_draws(stage, place, axis)
-    position = np.array([site[axis] for site in known]) * at.grid_pitch_m
-    left_out = np.setdiff1d(np.arange(at.shape[axis]) - at.half[axis],
-                            [site[axis] for site in known]) * at.grid_pitch_m
+    along = (at.x_m[:, 0], at.y_m[0])[axis]
+    position, left_out = along[place[axis]], np.delete(along, place[axis])
+    line_m = (line + at.off_centre[1 - axis]) * at.grid_pitch_m
     nothing = np.full(len(known), np.nan)
     if repeats is None:
         value = -error
         whole = float(np.ptp(value))
-        return AxisFigures("xy"[axis], line * at.grid_pitch_m, position, value, value, nothing,
+        return AxisFigures("xy"[axis], line_m, position, value, value, nothing,
                            nothing, (0, 0), left_out, {
                                "M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
     items = [repeats[site] for site in known]
@@ -243,7 +246,7 @@ def axis_figures(stage: StageMap, axis: int, line: int,
         s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down))
     found = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
-        "xy"[axis], line * at.grid_pitch_m, position, up, down, s_up, s_down,
+        "xy"[axis], line_m, position, up, down, s_up, s_down,
         (int(dof_up.min()) + 1, int(dof_down.min()) + 1), left_out,
         {name: Figure(float(value), _rms_about(draws[name], float(value)))
          for name, value in found.items()})
@@ -253,10 +256,10 @@ def _positions(stage: StageMap, axis: int, line: int,
                repeats: dict[tuple[int, int], Scatter] | None) -> list[tuple[int, int]]:
     """Return the known sites along a line, with repeats if there are some."""
     at, valid = stage.error_map.artifact, stage.error_map.valid
-    half = at.half[axis]
-    sites = [(i, line) if axis == 0 else (line, i) for i in range(-half, half + 1)]
-    known = [site for site in sites if abs(line) <= at.half[1 - axis]
-             and valid[site[0] + at.half[0], site[1] + at.half[1]]
+    (first, last), (low, high) = at.limits[axis], at.limits[1 - axis]
+    sites = [(i, line) if axis == 0 else (line, i) for i in range(first, last + 1)]
+    known = [site for site in sites if low <= line <= high
+             and valid[site[0] + at.middle[0], site[1] + at.middle[1]]
              and (repeats is None or site in repeats)]
     if len(known) < FEWEST:
         raise InputError(
@@ -347,7 +350,7 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
     """
     at = stage.error_map.artifact
     hx, hy = np.array(at.half) * at.grid_pitch_m
-    count = 2 * min(at.half) + 1
+    count = min(at.shape)
     along = np.linspace(-1, 1, count)
     ends = np.hypot(hx, hy)
     found = []

@@ -45,7 +45,7 @@ def session():
     ({"view_index": 2**31}, "a plan has at most 1000 views; correct the view_index"),
     ({"grid_size": 3}, "m goes beyond -1 to 1; correct the publisher"),
     ({"angular_count": 4}, "k goes beyond 0 to 3; correct the publisher"),
-    ({"grid_size": 2**31 + 1}, "is not an odd number from 3 to"),
+    ({"grid_size": 2**31 + 1}, "is not a number from 3 to"),
     ({"angular_count": 2**32 - 4}, "is not a number from 3 to "),
     ({"dx": [1000.1] * 25}, "'0': dx is not a number up to 1000; give m and rad"),
     ({"dy": [float("nan")] * 25}, "'0': dy is not a number up to 1000"),

@@ -128,11 +128,11 @@ def test_fields_of_a_command_by_name():
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"phase": 4}, "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT"),
-    ({"grid_size": 4}, "artifact grid_size: 4 is not an odd number"),
+    ({"grid_size": 2}, "artifact grid_size: 2 is not a number"),
     ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
-    ({"map_grid_size": 4, "map_grid_pitch": 0.1}, "map grid_size: 4 is not an odd number"),
+    ({"map_grid_size": 2, "map_grid_pitch": 0.1}, "map grid_size: 2 is not a number"),
     ({"angular_count": 7, "map_harmonics": 4}, "map harmonics: 4 harmonics cannot be told with 7"),
-    ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the map an odd number"),
+    ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the number of nodes"),
     ({"image_nx": 2}, "image"), ({"image_nx": 3, "image_ny": 2}, "image"),
     ({"map_grid_size": 5, "map_grid_pitch": 0.1, "map_interpolation": "cubic"},
      "map_interpolation: 'cubic' is not known; use one of bilinear, bicubic"),

@@ -28,6 +28,7 @@ from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from selfcal_ros.sessions import cell_check
 from test.support.mark_lists import listed_plan
+from test.support.plans import plan_of
 from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
@@ -136,6 +137,14 @@ def test_a_plate_with_a_list_of_marks_is_checked_by_the_innermost(graph):
     _, items = checked(graph, plan=listed_plan())
     assert failed(items) == set(), items
     assert "9 of 9 marks and 8 of 8 lines 2 times" in items["marks"].figure
+
+
+@pytest.mark.usefixtures("short")
+def test_a_plate_of_even_sides_is_checked_about_the_same_centre(graph):
+    """With a centre mark the stage would stop half a pitch beside every mark."""
+    _, items = checked(graph, plan=plan_of("0, 90, tx", 6, size_y=5, count=8))
+    assert failed(items) == set(), items
+    assert "12 of 12 marks and 8 of 8 lines 2 times" in items["marks"].figure
 
 
 @pytest.mark.usefixtures("short")

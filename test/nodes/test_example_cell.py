@@ -20,7 +20,7 @@ from selfcal_ros.nodes.solver import Solver
 EXAMPLE = Path(__file__).parents[2] / "examples/cell.py"
 PLAN = """
 plan_id: example
-artifact: {grid_size: 5, grid_pitch: 0.01, angular_count: 8}
+artifact: {grid_size: SIZE, grid_pitch: 0.01, angular_count: 8}
 check_stops: {marks: 5, offset: 20e-6}
 views:
   - {name: identity, repeats: 2}
@@ -37,8 +37,9 @@ def example():
     return module
 
 
-def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
-    (tmp_path / "plan.yaml").write_text(PLAN)
+@pytest.mark.parametrize("size", [5, 4])
+def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path, size):
+    (tmp_path / "plan.yaml").write_text(PLAN.replace("SIZE", str(size)))
     cell = example().Cell(context=graph.context)
     graph.add(cell)
     summaries, maps = graph.listen(names.SUMMARY), graph.listen(names.ERROR_MAP)
@@ -58,7 +59,7 @@ def test_the_example_is_calibrated_to_its_true_error(graph, tmp_path):
     assert {reason for status in statuses for reason in status.reject_reasons} <= {
         "no_encoder_sample_near", "stage_moving"}
     found = maps[-1]
-    index = np.arange(5) - 2
+    index = np.arange(size) - (size - 1) / 2
     x, y = (0.01 * part.ravel() for part in np.meshgrid(index, index, indexing="ij"))
     true = np.array([cell.machine.error(*at) for at in zip(x, y, strict=True)]).T
     difference = np.stack([np.array(found.gx), np.array(found.gy)]) - true

@@ -42,8 +42,9 @@ def undated(text: str) -> str:
 
 
 @pytest.fixture(scope="module", params=[None, placed_plan(count=8, repeats=2),
-                                        image_plan(5, count=8, repeats=2), listed_plan()],
-                ids=["on the lattice", "placed", "images", "a list of marks"])
+                                        image_plan(5, count=8, repeats=2), listed_plan(),
+                                        image_plan(6, count=8, repeats=2)],
+                ids=["on the lattice", "placed", "images", "a list of marks", "even sides"])
 def solved(request, tmp_path_factory):
     """Return a bag and the text of the result that `selfcal solve` writes for it."""
     folder = tmp_path_factory.mktemp("replay")

@@ -35,22 +35,13 @@ def run(tmp_path, monkeypatch):
 
 def test_every_page_with_python_is_run_here():
     assert {page.name for page in PAGES if "```python" in page.read_text()} == {
-        "apply.md", "bags.md", "cal.md", "estimation.md", "identifiability.md"}
+        "apply.md", "bags.md", "cal.md", "estimation.md"}
 
 
 def test_estimation(run):
     measurements = collected(events_of(small_plan("0, 90, 180, tx")))[1]
     found = run("estimation.md", measurements=measurements)
     assert np.isnan(found["result"].error_map.u_gx).all()  # the last line asks for the map only
-
-
-def test_identifiability(run, tmp_path):
-    """The list of an even lattice: about its centre, (i, j) with the id N i + j."""
-    run("identifiability.md")
-    marks = np.loadtxt(tmp_path / "marks.csv", delimiter=",", skiprows=1)
-    i, j = np.divmod(marks[:, 0], 8)
-    assert (marks[:, 0] == np.arange(64)).all()
-    assert marks[:, 1:] == pytest.approx(np.stack([i - 3.5, j - 3.5], axis=1) * 0.01, abs=1e-12)
 
 
 def test_cal(run, tmp_path):

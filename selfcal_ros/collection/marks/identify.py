@@ -161,10 +161,11 @@ def _nearest(pose: StagePose, centred: np.ndarray, artifact: Artifact,
         apart = distances(np.diff(artifact.marks.places_m[:, two], axis=2)[:, :, 0])
         mark = np.stack([artifact.marks.id_array[two[:, 0]], np.zeros(len(two), dtype=int)])
         return mark, away[:, 0] / np.maximum(away[:, 1], 1e-12 * pitch), away[:, 0], apart
-    half, step = np.array(artifact.half)[:, None], centred / pitch
+    (first_m, last_m), (first_n, last_n) = artifact.limits
+    step = centred / pitch
     plate = np.stack(pose.turned_back(step[0], step[1]))
-    mark = np.clip(np.rint(plate), -half, half)
-    away = np.abs(plate - mark)
+    mark = np.clip(artifact.nearest(*plate), [[first_m], [first_n]], [[last_m], [last_n]])
+    away = np.abs(plate - np.stack(artifact.places(*mark)))
     first = distances(away)
     second = np.minimum(np.hypot(1 - away[0], away[1]), np.hypot(away[0], 1 - away[1]))
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, every
@@ -184,7 +185,7 @@ def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.nd
     use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
     innermost = _innermost_of_list if artifact.marks else _innermost
     known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
-             innermost(_rows(pose), centred[:, free], artifact, rules.max_rotation_rad))
+             innermost(_rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad))
     while free.any():
         nominal = known.rigid.undo(centred)
         nearest, ratio, _, apart = _nearest(pose, nominal, artifact)
@@ -197,12 +198,17 @@ def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.nd
         fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
     whole = named.any() or artifact.marks
-    return (known, fit) if whole else _folded(_rows(pose), known, fit, pitch)
+    return (known, fit) if whole else _folded(
+        _rows(pose, artifact), known, fit, pitch)
 
 
-def _rows(pose: StagePose) -> StagePose:
-    """Return the pose as far as rows of marks turn with it: on the lattice not at all."""
-    return LatticePose(0, (0, 0), None) if isinstance(pose, LatticePose) else pose
+def _rows(pose: StagePose, artifact: Artifact) -> StagePose:
+    """Return the pose as far as rows of marks turn with it: on the lattice not at all.
+
+    Unless the rows lie otherwise about the centre along x than along y.
+    """
+    alike = isinstance(pose, LatticePose) and len(set(artifact.off_centre)) == 1
+    return LatticePose(0, (0, 0), None) if alike else pose
 
 
 def _innermost(rows: StagePose, centred: np.ndarray, artifact: Artifact,
@@ -213,8 +219,9 @@ def _innermost(rows: StagePose, centred: np.ndarray, artifact: Artifact,
         return rigids.MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
-    offset = np.array([_middle(row * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
-                       for row in rows.turned_back(*centred[:, near])])
+    offset = np.array([
+        _middle((row - off * pitch) * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
+        for row, off in zip(rows.turned_back(*centred[:, near]), artifact.off_centre, strict=True)])
     x, y = map(float, rows.turned(*offset))
     return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
                           max_rotation_rad)

@@ -134,7 +134,7 @@ def marks_shown(artifact: Artifact, view: View) -> tuple[np.ndarray, ...]:
     """
     marks, _ = view.on_stage(artifact).marks_in_field(artifact)
     stops = np.zeros(artifact.shape, dtype=bool)
-    stops[tuple(marks + np.array(artifact.half)[:, None])] = True
+    stops[artifact.index(*marks)] = True
     return tuple(beside(stops, artifact, sub) for sub in view.sub_views)
 
 

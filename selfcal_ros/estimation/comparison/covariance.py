@@ -138,7 +138,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         cover, whole = xy_covariance(result, known)
         if not whole:
             return float("nan"), float("nan")
-        z = (result.artifact.m + 1j * result.artifact.n).astype(complex)
+        z = (result.artifact.x_m + 1j * result.artifact.y_m) / pitch_m
         shear = Gauge(z, known, scale=True).shear[:, known]
         rows = np.concatenate([shear.real, shear.imag], axis=1)
         u = np.sqrt(np.diag(rows @ cover @ rows.T)) / pitch_m

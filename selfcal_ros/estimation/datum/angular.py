@@ -77,7 +77,7 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     Raises
     ------
     InputError
-        For ``xy_axes`` if a half axis is not completely determined, or has no line.
+        For ``xy_axes`` if a half axis has no sites or no line, or is not completely determined.
     """
     return _of_system.get(system, (datum, sense, half_width_m),
                           lambda: _conditions(system, datum, sense, half_width_m))
@@ -109,6 +109,9 @@ def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
 
 def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
     """Raise InputError unless all four half axes and their lines are determined."""
+    if not all(size % 2 for size in known.shape):
+        raise InputError("theta datum xy_axes", f"no sites of {known.shape[0]} x {known.shape[1]} "
+                         "lie on the axes", "use zero_mean, or odd numbers of sites")
     hx, hy = (size // 2 for size in known.shape)
     halves = (("+x", known[hx + 1:, hy]), ("+y", known[hx, hy + 1:]), ("-x", known[:hx, hy]),
               ("-y", known[hx, :hy]))

@@ -318,7 +318,7 @@ class MapsCovariance:
         for v, pose in enumerate(views.poses):
             turn = PHASES[pose.q]
             back = -turn.conj() * (pose.a + 1j * pose.b)
-            poses.append(LatticePose(-pose.q % 4, (round(back.real), round(back.imag)), None))
+            poses.append(LatticePose(-pose.q % 4, (back.real + 0.0, back.imag + 0.0), None))
             # about the centre of the field, in the stage frame: phi, t - phi i T (T: the shift)
             move[3 * v:3 * v + 3, 3 * v:3 * v + 3] = [
                 [1, 0, 0], [pose.b / views.unit, turn.real, -turn.imag],

@@ -336,9 +336,9 @@ def _read_and_shown(measurements: Measurements
     for name, _, (m, n), one in parts:
         stops.setdefault(name, set()).update(zip((one.m - m).tolist(), (one.n - n).tolist(),
                                              strict=True))
-    hx, hy = measurements.artifact.half
-    return {(name, cell): (len(one.m), sum(abs(i + m) <= hx and abs(j + n) <= hy
-                                           for i, j in stops[name]))
+    (first_m, last_m), (first_n, last_n) = measurements.artifact.limits
+    return {(name, cell): (len(one.m), sum(
+        first_m <= i + m <= last_m and first_n <= j + n <= last_n for i, j in stops[name]))
             for name, cell, (m, n), one in parts}
 
 

@@ -209,12 +209,14 @@ def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
     """Return the sites and lines of the map, stage frame, that only single readings determine."""
-    sites = np.argwhere(system.unchecked_sites) - np.array(system.grid.views.half)
+    flipped = sense is Sense.PLATE_MOVES  # as the map itself: G(X) = -H(-X)
+    unchecked = system.unchecked_sites[::-1, ::-1] if flipped else system.unchecked_sites
+    sites = np.argwhere(unchecked) - np.array(unchecked.shape) // 2
     lines = np.argwhere(system.unchecked_lines)
     if not len(sites) and not len(lines):
         return ()
-    if sense is Sense.PLATE_MOVES:  # as the map itself: G(X) = -H(-X)
-        sites, lines = -sites[::-1], np.sort(-lines % max(system.angular.n_lines, 1), axis=0)
+    if flipped:
+        lines = np.sort(-lines % max(system.angular.n_lines, 1), axis=0)
     return (Finding("unchecked", details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()}),)
 
 

@@ -10,6 +10,7 @@ R(phi) = exp(i phi).
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,13 +37,13 @@ class Window:
     transposed: bool
 
 
-def window(pose: LatticePose, half: tuple[int, int]) -> Window:
+def window(pose: LatticePose, half: tuple[float, float]) -> Window:
     """Return the marks of a view inside the field, and their sites, as slices.
 
-    Site = R^q (m, n) + (a, b); a field with half widths `half`.
+    Site = R^q (u, v) + (a, b); a field with half widths `half`, pitches.
     """
     (hx, hy), swap = half, pose.q % 2 == 1
-    # stage x = sx * (m or n) + a, stage y = sy * (n or m) + b
+    # stage x = sx * (u or v) + a, stage y = sy * (v or u) + b
     sx, sy = ((1, 1), (-1, 1), (-1, -1), (1, -1))[pose.q]
     along_x, along_y = ((hy, hx) if swap else (hx, hy))
     p = _run(sx, pose.a, along_x, hx)
@@ -51,15 +52,18 @@ def window(pose: LatticePose, half: tuple[int, int]) -> Window:
     return Window(marks, (p[1], r[1]), swap)
 
 
-def _run(sign: int, shift: int, half_mark: int, half_site: int) -> tuple[slice, slice]:
-    """Return the slices of u in [-half_mark, half_mark] with sign*u + shift in the field."""
+def _run(sign: int, shift: float, half_mark: float, half_site: float) -> tuple[slice, slice]:
+    """Return the slices of u in [-half_mark, half_mark] with sign*u + shift in the field.
+
+    Steps of 1. All ends are whole numbers, or all odd multiples of 1/2.
+    """
     ends = sorted((sign * (-half_site - shift), sign * (half_site - shift)))
     low, high = max(ends[0], -half_mark), min(ends[1], half_mark)
     if low > high:
         return slice(0), slice(0)
-    first, last = sign * low + shift + half_site, sign * high + shift + half_site
+    first, last = (int(sign * end + shift + half_site) for end in (low, high))
     stop = last + sign
-    return (slice(low + half_mark, high + half_mark + 1),
+    return (slice(int(low + half_mark), int(high + half_mark) + 1),
             slice(first, None if stop < 0 else stop, sign))
 
 
@@ -72,28 +76,28 @@ class LatticeViews:
         Marks (and sites) along x and y.
     poses : tuple of LatticePose
         One per view.
-    unit : int
+    unit : float
         Pitches in the unit of positions; 0 = the longer half width.
     """
 
     def __init__(self, shape: tuple[int, int], poses: tuple[LatticePose, ...],
-                 unit: int = 0) -> None:
+                 unit: float = 0) -> None:
         self.shape, self.poses = shape, poses
-        self.half = (shape[0] - 1) // 2, (shape[1] - 1) // 2
+        self.half = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         self.unit = unit or max(self.half)
         self.windows = tuple(window(pose, self.half) for pose in poses)
 
     @property
     def reach(self) -> int:
-        """Largest folded distance, in pitches, of two sites visited by one mark."""
-        out = 0
+        """Largest folded distance, in pitches, of two sites visited by one mark, rounded up."""
+        out = 0.0
         for p in self.poses:
             for r in self.poses:
                 if p.q == r.q:
                     out = max(out, abs(p.a - r.a), abs(p.b - r.b))
                 else:
                     out = max(out, max(abs(p.a), abs(p.b)) + max(abs(r.a), abs(r.b)))
-        return out
+        return ceil(out)
 
     @property
     def plate_shape(self) -> tuple[int, int]:
@@ -102,11 +106,11 @@ class LatticeViews:
 
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
         """Return the m and n of a mark by its index."""
-        return int(i) - self.half[0], int(j) - self.half[1]
+        return int(i) - self.shape[0] // 2, int(j) - self.shape[1] // 2
 
     def index_of(self, m: int, n: int) -> tuple[int, int]:
         """Return the index of a mark."""
-        return m + self.half[0], n + self.half[1]
+        return m + self.shape[0] // 2, n + self.shape[1] // 2
 
     @cached_property
     def phases(self) -> np.ndarray:
@@ -125,9 +129,9 @@ class LatticeViews:
 
     @cached_property
     def z(self) -> np.ndarray:
-        """Mark positions m + i n in the unit, complex (nx, ny)."""
-        hx, hy = self.half
-        return (np.arange(-hx, hx + 1)[:, None] + 1j * np.arange(-hy, hy + 1)) / self.unit
+        """Mark positions in the unit, complex (nx, ny)."""
+        x, y = (np.arange(size) - half for size, half in zip(self.shape, self.half, strict=True))
+        return (x[:, None] + 1j * y) / self.unit
 
     @cached_property
     def in_field(self) -> np.ndarray:

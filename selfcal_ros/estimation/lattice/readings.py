@@ -70,7 +70,8 @@ def in_field(pose: AnyPose, artifact: Artifact) -> np.ndarray:
     """Return the marks of a view that lie in the field, bool (nx, ny)."""
     if isinstance(pose, MapPose):
         return pose.in_field
-    return ~pose.beyond_field(np.stack(pose.site_of(artifact.m, artifact.n)), artifact)
+    places = artifact.places(artifact.m, artifact.n)
+    return ~pose.beyond_field(np.stack(pose.site_of(*places)), artifact)
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,7 +156,7 @@ def _first_order_rows(artifact: Artifact) -> np.ndarray:
     """Return the six sums of eq. 7 over F, in lattice units."""
     one = np.ones(artifact.shape)
     rows = np.zeros((6, 2, *artifact.shape))
-    for index, weight in enumerate((one, artifact.m, artifact.n)):
+    for index, weight in enumerate((one, *artifact.places(artifact.m, artifact.n))):
         rows[index, 0] = rows[index + 3, 1] = weight / np.linalg.norm(weight)
     return rows.reshape(6, -1)
 

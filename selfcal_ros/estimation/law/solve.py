@@ -108,8 +108,11 @@ def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
     Raises
     ------
     InputError
-        If the half axes are too short for the slopes of eq. 27.
+        If the half axes are too short for the slopes of eq. 27, or have no sites.
     """
+    if datum is ThetaDatum.XY_AXES and artifact.grid_size % 2 == 0:
+        raise InputError("method law", f"no marks of {artifact.grid_size} rows lie on the axes, "
+                         "which have no slope (Hu eq. 27)", "use the theta datum zero_mean")
     if datum is ThetaDatum.XY_AXES and artifact.grid_size < 5:
         raise InputError("method law", "a half axis of one mark has no slope (Hu eq. 27)",
                          "use the theta datum zero_mean")
@@ -174,7 +177,7 @@ def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:
 
 def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
     values = np.full((2, *artifact.shape), np.nan)
-    at = view.m + artifact.half[0], view.n + artifact.half[1]
+    at = artifact.index(view.m, view.n)
     values[0][at], values[1][at] = view.dx, view.dy
     return values
 
@@ -281,7 +284,7 @@ def _unit_noise(artifact: Artifact, views: list[ViewReadings], *, kind: int,
 
 def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) -> np.ndarray:
     counts = np.full(artifact.shape, np.nan)
-    counts[view.m + artifact.half[0], view.n + artifact.half[1]] = view.count
+    counts[artifact.index(view.m, view.n)] = view.count
     return np.broadcast_to(1 / np.sqrt(counts[:shape[1]]), shape)
 
 

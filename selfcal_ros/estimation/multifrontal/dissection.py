@@ -100,13 +100,12 @@ def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
 
 
 def _quadrants(shape: tuple[int, int]) -> np.ndarray:
-    """Return k of every site, X = R^k o with o in the quadrant m > 0, n >= 0; the centre has 0."""
-    hx, hy = (size // 2 for size in shape)
-    m = np.repeat(np.arange(-hx, hx + 1), shape[1])
-    n = np.tile(np.arange(-hy, hy + 1), shape[0])
-    out = np.where((m <= 0) & (n > 0), 1, 0)
-    out[(m < 0) & (n <= 0)] = 2
-    out[(m >= 0) & (n < 0)] = 3
+    """Return k of every site, X = R^k o with o in the quadrant x > 0, y >= 0; the centre has 0."""
+    x, y = (np.arange(size) - (size - 1) / 2 for size in shape)
+    x, y = np.repeat(x, shape[1]), np.tile(y, shape[0])
+    out = np.where((x <= 0) & (y > 0), 1, 0)
+    out[(x < 0) & (y <= 0)] = 2
+    out[(x >= 0) & (y < 0)] = 3
     return out
 
 
@@ -209,8 +208,9 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     reach : int
         Largest folded distance of two sites joined by the matrix.
     """
-    hx, hy = (size // 2 for size in shape)
-    i, j = abs(folded.free // shape[1] - hx), abs(folded.free % shape[1] - hy)
+    # |x| and |y|, rounded down to whole pitches
+    i, j = (abs(2 * at - size + 1) // 2 for at, size in zip(
+        np.divmod(folded.free, shape[1]), shape, strict=True))
     far, near = np.maximum(i, j), np.minimum(i, j)
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
     # consecutive: the variables of a front are contiguous in memory

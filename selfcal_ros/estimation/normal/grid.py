@@ -34,14 +34,14 @@ class GridSystem:
         One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
-    unit : int
+    unit : float
         Pitches in the unit of positions; 0 = the longer half width.
     rotations : tuple of int
         The first of the views that have the rotation of each view, see `rotations_of`. Empty: each
         view has its own.
     """
 
-    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: int = 0,
+    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: float = 0,
                  rotations: tuple[int, ...] = ()) -> None:
         self.weight, self.rotations = weight, rotations
         self.views = LatticeViews(weight.shape[1:], poses, unit)

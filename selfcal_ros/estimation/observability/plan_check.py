@@ -142,9 +142,11 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
         `OTHER_TURN_DEG` for a Fourier map.
     """
     pitch = artifact.grid_pitch_m
+    beside = artifact.quarter_shift * pitch
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
-    views = [View(f"{90 * q}deg{name}", q * math.pi / 2, (a * pitch, b * pitch), True,
-                  angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0))
+    views = [View(f"{90 * q}deg{name}", q * math.pi / 2,
+                  (a * pitch + q % 2 * beside, b * pitch + q % 2 * beside), True, angular and (
+                      bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0))
              for (a, b), name in names.items() for q in range(4)
              if q % 2 == 0 or artifact.marks or artifact.shape[0] == artifact.shape[1]
              or (a, b) == (0, 0)]
@@ -190,8 +192,9 @@ def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
 def smaller(plan: Plan, size: int) -> Plan:
     """Return the plan on a field of at most `size` sites per side, with the same turns and shifts.
 
-    The field keeps its proportions, on which the uncertainty of a long field depends, and is
-    large enough for the plan's own shifts. A list of marks remains as it is.
+    The field keeps its proportions, on which the uncertainty of a long field depends, and sides of
+    even or odd numbers, and is large enough for the plan's own shifts. A list of marks remains as
+    it is.
     """
     if plan.artifact.marks:
         return plan
@@ -199,7 +202,7 @@ def smaller(plan: Plan, size: int) -> Plan:
              for view in with_sub_views(plan.views)]
     room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
-    nx, ny = (max(2 * round((n * part - 1) / 2) + 1, min(n, max(room, NARROW)))
+    nx, ny = (max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
               for n in plan.artifact.shape)
     plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
                      0 if nx == ny else ny, harmonics=plan.artifact.harmonics)

@@ -180,7 +180,7 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
     poses = [view.pose for view in views if view.grid]
     advice, step = [], one_pitch(artifact)
     if len({round((pose.turn_rad / math.pi) % 1, 6) % 1 for pose in poses}) < 2:
-        advice.append("add a view turned by 90 deg")
+        advice.append(f"add a view {quarter_turn(artifact)}")
     if len({(round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
             for x, y in (pose.shift_m for pose in poses)}) < 2:
         advice.append(f"add a view shifted by {step} along X")
@@ -195,15 +195,21 @@ def one_pitch(artifact: Artifact) -> str:
     return f"{artifact.grid_pitch_m * MM_PER_M:.2g} mm" if artifact.marks else "one pitch"
 
 
+def quarter_turn(artifact: Artifact) -> str:
+    """Return a quarter turn in words, with the shift that it needs to lie on the lattice."""
+    beside = " and shifted by half a pitch along X and Y" if artifact.quarter_shift else ""
+    return f"turned by 90 deg{beside}"
+
+
 def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
     """Return the first single view, by trial, that cures the plan."""
-    pitch = artifact.grid_pitch_m
+    pitch, beside = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
     if artifact.map_grid is not None:
         return (f"add views turned by 90 deg and shifted by about {one_pitch(artifact)}, or give "
                 "the map fewer nodes",)
     for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
                               ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
-                              ("turned by 90 deg", math.pi / 2, (0.0, 0.0)),
+                              (quarter_turn(artifact), math.pi / 2, (beside, beside)),
                               ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
         more = View("", turn, shift, True, artifact.angular_count > 0 and (
             not turn or artifact.angular_count % 4 == 0))

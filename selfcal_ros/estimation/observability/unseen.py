@@ -156,9 +156,8 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
 
 def _smallest(grid: GridSystem, label: np.ndarray) -> str:
     numbers, sizes = np.unique(label[label >= 0], return_counts=True)
-    hx, hy = grid.views.half
     at = np.argwhere(label == numbers[np.argmin(sizes)])
-    text = ", ".join(f"({i - hx}, {j - hy})" for i, j in at[:4])
+    text = ", ".join(f"({m}, {n})" for m, n in at[:4] - np.array(grid.views.shape) // 2)
     return text + (", ..." if len(at) > 4 else "")
 
 
@@ -167,7 +166,7 @@ def unvisited_family(grid: GridSystem) -> UnseenMode | None:
     missing = (grid.components.of_site < 0).reshape(grid.views.shape)
     if not missing.any():
         return None
-    at = np.argwhere(missing)[0] - np.array(grid.views.half)
+    at = np.argwhere(missing)[0] - np.array(grid.views.shape) // 2
     return UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark reaches, "
                       f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
 

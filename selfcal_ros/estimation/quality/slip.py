@@ -269,9 +269,8 @@ def slip_at_line(ground: TermInputs, row: int, slip: Slip, phase: complex) -> Te
     phase : complex
         Factor from the stage frame to the plate frame in that view.
     """
-    half = ((ground.z.shape[0] - 1) // 2, (ground.z.shape[1] - 1) // 2)
     axis = "mn".index(slip.axis)
-    line = np.indices(ground.z.shape)[axis] - half[axis]
+    line = np.indices(ground.z.shape)[axis] - ground.z.shape[axis] // 2
     after = (line >= slip.first) & (ground.weight[row] > 0)
     made, nowhere = ColumnBuilder(), [None] * len(ground.names)
     for form, parts in ((phase, (("x", 1), ("y", 1j))), (ground.z, (("phi", 1j),))):

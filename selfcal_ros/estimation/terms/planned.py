@@ -128,8 +128,8 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     phase = PHASES[-pose.q % 4] if isinstance(pose, LatticePose) else view.pose.phase.conjugate()
     mark = artifact.flat(found.m, found.n)
     near = mark if artifact.marks else artifact.flat(*(
-        np.clip(np.rint(at), -h, h).astype(int)  # the nearest, off the lattice
-        for at, h in zip((found.i, found.j), artifact.half, strict=True)))
+        np.clip(at, *ends).astype(int)  # the nearest, off the lattice
+        for at, ends in zip(artifact.nearest(found.i, found.j), artifact.limits, strict=True)))
     stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] / phase
     u, v = artifact.places(found.m, found.n)
     arm = (u + 1j * v) * artifact.grid_pitch_m / phase

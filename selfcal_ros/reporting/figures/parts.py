@@ -51,15 +51,15 @@ def map_frame(drawing: draw.Drawing, artifact: Artifact,
 
 
 def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
-    """Return slices that keep at most `most` sites per side, including the centre.
+    """Return slices that keep at most `most` sites per side, including the site m = n = 0.
 
     Of a list of marks as many as of such a lattice.
     """
     if artifact.marks:
         return slice(0, None, max(1, math.ceil(artifact.shape[0] / most**2))), slice(0, None, None)
     step = max(1, math.ceil(max(artifact.shape) / most))
-    half_x, half_y = artifact.half
-    return slice(half_x % step, None, step), slice(half_y % step, None, step)
+    i, j = artifact.middle
+    return slice(i % step, None, step), slice(j % step, None, step)
 
 
 def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
