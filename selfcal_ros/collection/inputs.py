@@ -15,7 +15,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.plan_form import MAX_VIEWS
-from selfcal_ros.model.readings import GridVisits, ViewReadings
+from selfcal_ros.model.readings import REPEAT_OUTLIER, GridVisits, ViewReadings
 from selfcal_ros.model.view import View
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
@@ -261,7 +261,7 @@ class Reason(StrEnum):
     SEVERAL = "other_mark_of_one_exposure"
     LOW_SCORE = "low_score"
     DUPLICATE = "duplicate"
-    OUTLIER = "outlier_among_repeats"
+    OUTLIER = REPEAT_OUTLIER
     ENCODER_UNKNOWN_JOINT = "encoder_sample_unknown_joint"
     ENCODER_NOT_FINITE = "encoder_sample_not_finite"
     ENCODER_MALFORMED = "encoder_sample_malformed"

@@ -41,7 +41,8 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     with_coverage,
 )
 from selfcal_ros.model.error_map import rms
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.pose import without_cell
+from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, VISIT_TERMS, ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Provenance, Verdict
@@ -65,6 +66,9 @@ the readings have determined it."""
 UNEXPLAINED = 1.5
 """Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which
 the uncertainty from the residuals is taken to cover it."""
+
+FEW_OUTLIERS, MANY_OUTLIERS = 5, 0.1
+"""Outliers among repeats of a view, and their part of its readings, that are not chance."""
 
 
 @one_thread()
@@ -108,6 +112,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
                               (cause.name, cause.unit) for cause in searched.causes]]))
     result = replace(
         result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked),
+                                                 *_repeats_findings(measurements),
                                                  *_untested(solved)),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
@@ -253,6 +258,18 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     visits = [view for view in problem.ground.visits if view is not None]
     once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
     return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
+
+
+def _repeats_findings(measurements: Measurements) -> list[Finding]:
+    """Return a finding for each view in which repeats of marks often contradict each other."""
+    found: dict[str, tuple[int, int]] = {}
+    for view in measurements.views:
+        lost, name = view.rejected.get(REPEAT_OUTLIER, 0), without_cell(view.view.name)
+        before = found.get(name, (0, 0))
+        found[name] = before[0] + lost, before[1] + lost + view.used
+    return [Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
+            for name, (lost, total) in found.items()
+            if lost > max(FEW_OUTLIERS, MANY_OUTLIERS * total)]
 
 
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:

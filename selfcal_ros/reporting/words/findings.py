@@ -216,7 +216,7 @@ SENTENCES: dict[str, Words] = {
         f"{of['u_rms_without'] * UM_PER_M:.3g} instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)" + (
             f"; {_counted([tuple(at) for at in of['left_out']], 'node')} may deviate from that "
             "field: no prior there" if of["left_out"] else "")),
-    "few_read": phrases.few_read_text,
+    "few_read": phrases.few_read_text, "repeats_contradict": phrases.repeats_contradict_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (
         f"the plate is {_either(f, 'larger', 'smaller')} than the encoders indicate by "

@@ -53,6 +53,13 @@ def few_read_text(found: Finding, of: dict[str, Any]) -> str:
             + (f"; {unknown}" if of["unknown"] != [] else ""))
 
 
+def repeats_contradict_text(found: Finding, of: dict[str, Any]) -> str:
+    """Return the sentence on a view in which many readings are outliers among repeats."""
+    return (f"{of['rejected']} of {of['of']} readings of view '{found.view}' contradict the other "
+            "repeats of their marks and were left out: the plate slipped within the view, or a "
+            "second publisher sent readings (ros2 topic info -v); measure it again")
+
+
 def _named(cells: Sequence[Any]) -> str:
     return f"cell{'s' * (len(cells) > 1)} {', '.join(map(cell_label, cells))}"
 

@@ -189,6 +189,24 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
     assert result.findings == ((Finding("visited_once"),) if said else ())
 
 
+@pytest.mark.parametrize(("lost", "said"), [(0, False), (20, False), (60, True)])
+def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
+    """20 of 220 readings may be chance, 60 of 260 are more than that."""
+    plan, rng = plan_of("serpentine", 4), np.random.default_rng(1)
+    truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
+    readings = simulate_measurements(truth, plan, rng, visits=True, settings=SETTINGS)
+    first, *others = readings.views
+    first = replace(first, used=200, rejected={"outlier_among_repeats": lost, "low_score": 99})
+    result = worded(calibrate(replace(readings, views=(first, *others)), OPTIONS))
+    assert [found.name for found in result.findings] == ["repeats_contradict"] * said
+    for found in result.findings:
+        assert (found.view, found.details) == (first.view.name, {"rejected": lost, "of": 260})
+        assert found.text == (
+            f"60 of 260 readings of view '{first.view.name}' contradict the other repeats of their "
+            "marks and were left out: the plate slipped within the view, or a second publisher "
+            "sent readings (ros2 topic info -v); measure it again")
+
+
 def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
     found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
     columns = SimpleNamespace(
