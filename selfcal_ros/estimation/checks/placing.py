@@ -9,7 +9,7 @@ estimated from the readings, the readings of all views have a normal likelihood 
 the plate: the errors of the marks, which they carry from view to view, show the right one. Each
 view has a free offset, rotation, strain and bending, which are not mistaken for another pose. The
 stage's errors are independent from site to site; at any pose they are a field as smooth as the
-nodes of the map are apart. Of 1,000 clean simulated measurements on the lattice none was refused,
+nodes of the map are apart. Of images, the marks on the optical axis are compared. Of 1,000 clean simulated measurements on the lattice none was refused,
 and 200 wrongly placed plates were named.
 """
 
@@ -101,7 +101,7 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     """Return the view in which the plate is placed differently, if the readings show one."""
     artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
     told = [(view.view, seen) for view in measurements.views
-            if (seen := _seen(artifact, view)) is not None]
+            if view.view.cell in (None, (0, 0)) and (seen := _seen(artifact, view)) is not None]
     views = [seen for _, seen in told]
     if len(views) < 3:
         return None
@@ -130,7 +130,7 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     second = tried[1][0] if len(tried) > 1 else 0.0
     if gain < BETTER or gain - second < CLEARLY or left > max(CONTRADICTED, LEFT * square):
         return None
-    return Misplaced.of(view.name, before, pose, gain)
+    return Misplaced.of(view.plan_view, before, pose, gain)
 
 
 def other_poses(pose: StagePose) -> Iterator[Any]:

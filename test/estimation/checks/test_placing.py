@@ -9,12 +9,14 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import collect, gathered, scene
 from test.support.mark_lists import lattice, rings, scatter
 from test.support.misplaced import NOISE, laid, laid_at
 from test.support.placed import SIX, plate
-from test.support.plans import plan_of
+from test.support.plans import image_plan, plan_of
+from test.support.truth import random_truth, simulate_measurements
 
 WRONG = {  # what the plan says, where the plate lies, in which view, and what is said
     "clockwise": ("0, 90, tx", "0, 270, tx", 1, "turned by 270°, not by 90°; turn it counter-"
@@ -62,6 +64,21 @@ def unrepeated(readings):
     """Return readings of which nothing tells the noise of repeats."""
     return replace(readings, views=tuple(
         replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views))
+
+
+@pytest.mark.parametrize("repeats", [1, 2])
+@pytest.mark.parametrize("sense", list(Sense))
+def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats):
+    truth = random_truth(Artifact(7, 1e-3, 0), 3, np.random.default_rng(3))
+    planned, lies = (simulate_measurements(
+        truth, image_plan(7, turns=(0, turn, 180), repeats=repeats), np.random.default_rng(4),
+        sigma_m=2e-8, sense=sense) for turn in (90, 270))
+    assert len(lies.views) == 27 and misplaced(planned) is None and misplaced(lies) is None
+    views = tuple(replace(there, view=here.view, m=-there.m, n=-there.n)
+                  if there.view.plan_view == "270" else there
+                  for here, there in zip(planned.views, lies.views, strict=True))
+    found = misplaced(replace(lies, views=views))
+    assert found is not None and (found.view, found.found_deg) == ("90", 270)
 
 
 @pytest.mark.parametrize("sense", list(Sense))
