@@ -128,16 +128,21 @@ def test_moves_by_a_whole_pitch_are_refused(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "nodes.yaml").exists()
 
 
+def table_of(folder, factor_x, factor_y):
+    """Write the images of the moves, and p.csv: the positions, each axis times a factor."""
+    rows = ["file,x,y"]
+    images = views(Camera(width=200, height=180, pixel_size_m=2.6e-6))
+    for number, ((x, y), values) in enumerate(zip(MOVES, images, strict=True)):
+        Image.fromarray(values).save(folder / f"{number}.png")
+        rows.append(f"{number}.png,{factor_x * x},{factor_y * y}")
+    (folder / "p.csv").write_text("\n".join(rows))
+
+
 @pytest.mark.parametrize(("factor", "options", "by_moves", "by_mark"), [
     (1e3, [], "2.6e+03", "2.63"), (1.0, ["--mark-size", "50"], "2.6", "2.63e+06")])
 def test_positions_or_marks_in_other_units_are_refused(tmp_path, capsys, factor, options, by_moves,
                                                        by_mark):
-    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
-    rows = ["file,x,y"]
-    for number, (move, values) in enumerate(zip(MOVES, views(camera), strict=True)):
-        Image.fromarray(values).save(tmp_path / f"{number}.png")
-        rows.append(f"{number}.png,{factor * move[0]},{factor * move[1]}")
-    (tmp_path / "p.csv").write_text("\n".join(rows))
+    table_of(tmp_path, factor, factor)
     assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"),
                 *options) == 2
     [line] = capsys.readouterr().err.splitlines()
@@ -147,12 +152,7 @@ def test_positions_or_marks_in_other_units_are_refused(tmp_path, capsys, factor,
 
 def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
     """The encoder of y counts half: the image of the motion is no similar one."""
-    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
-    rows = ["file,x,y"]
-    for number, (move, values) in enumerate(zip(MOVES, views(camera), strict=True)):
-        Image.fromarray(values).save(tmp_path / f"{number}.png")
-        rows.append(f"{number}.png,{move[0]},{move[1] / 2}")
-    (tmp_path / "p.csv").write_text("\n".join(rows))
+    table_of(tmp_path, 1.0, 0.5)
     assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 2
     assert "the image of the motion is sheared by 33" in capsys.readouterr().err
 

@@ -10,6 +10,7 @@ import pytest
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
 from test.support.details import simulated_details
+from test.support.verbs import simulate, two_and_a_view
 
 VIEWS = [{"name": "0", "repeats": 2}, {"name": "90", "rotation_deg": 90, "repeats": 2},
          {"name": "180", "rotation_deg": 180, "repeats": 2},
@@ -17,41 +18,16 @@ VIEWS = [{"name": "0", "repeats": 2}, {"name": "90", "rotation_deg": 90, "repeat
          {"name": "ty", "translation_pitch": [0, 1], "repeats": 2},
          {"name": "line", "rotation_deg": 45, "grid": False}]
 PLATE = {"grid_size": [6, 4], "grid_pitch": 0.01, "angular_count": 8}
+PLAN = {"plan_id": "even", "artifact": PLATE, "views": VIEWS}
 MACHINE = {"seed": 5, "truth": {"correlation": 4, "phi": 1e-4}}
 NOISE = {"sigma_xy": 2e-8, "sigma_theta": 1e-6}
 X, Y = np.array([-25, -15, -5, 5, 15, 25]) * 1e-3, np.array([-15, -5, 5, 15]) * 1e-3
 
 
-def simulated(folder, name, views, **machine):
-    plan = {"plan_id": "even", "artifact": PLATE, "views": views}
-    (folder / f"{name}_plan.yaml").write_text(json.dumps(plan))  # YAML, too
-    (folder / f"{name}.yaml").write_text(json.dumps(MACHINE | {"plan": f"{name}_plan.yaml"}
-                                                    | machine))
-    assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Two calibrations of one machine and plate, their results, and a view on another day."""
-    folder = tmp_path_factory.mktemp("even")
-    for name, views, seed in (("one", VIEWS, 1), ("two", VIEWS, 2), ("again", VIEWS[:1], 3)):
-        simulated(folder, name, views, noise=NOISE, noise_seed=seed)
-        if name != "again":
-            assert main(["solve", str(folder / name), "-o", str(folder / f"{name}.json"),
-                         "--quiet"]) == 0
-    return folder
-
-
-@pytest.fixture
-def said(folder, monkeypatch, capsys):
-    """Return a call of a verb in the folder: its output, and its code, 0 unless given."""
-    monkeypatch.chdir(folder)
-
-    def call(*words: str, code: int = 0) -> str:
-        assert main(list(words)) == code
-        return "".join(capsys.readouterr())
-
-    return call
+    return two_and_a_view(tmp_path_factory.mktemp("even"), PLAN, (1, 2, 3), noise=NOISE, **MACHINE)
 
 
 def numbers(line):
@@ -62,7 +38,7 @@ def numbers(line):
 @pytest.mark.parametrize("with_ids", [True, False])
 def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
     cell = {"with_ids": with_ids, "sense": sense, "servo_sigma": 0.0, "servo_sigma_theta": 0.0}
-    simulated(tmp_path, "exact", VIEWS, cell=cell, truth={"phi": 1e-4})
+    simulate(tmp_path, "exact", PLAN, seed=5, cell=cell, truth={"phi": 1e-4})
     assert main(["solve", str(tmp_path / "exact"), "--sense", sense, "--quiet", "-o",
                  str(tmp_path / "r.json")]) == 0
     found, truth = (read_json(tmp_path / name) for name in ("r.json", "exact/truth.json"))

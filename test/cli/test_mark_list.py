@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
 from test.support.details import simulated_details
 from test.support.mark_lists import scatter
+from test.support.verbs import two_and_a_view
 
 MARKS = scatter(90).marks
 VIEWS = [{"name": "0", "repeats": 2}, {"name": "90", "rotation_deg": 90, "repeats": 2},
@@ -29,30 +29,9 @@ def folder(tmp_path_factory):
     (folder / "marks.csv").write_text("id,x,y\n" + "".join(
         f"{mark},{x!r},{y!r}\n" for mark, x, y in zip(MARKS.ids, MARKS.x_m, MARKS.y_m,
                                                      strict=True)))
-    for name, views in (("one", VIEWS), ("two", VIEWS), ("again", VIEWS[:1])):
-        plan = {"plan_id": "list", "artifact": {"marks": "marks.csv", "angular_count": 8},
-                "map": {"grid_size": 5}, "views": views}
-        (folder / f"{name}_plan.yaml").write_text(json.dumps(plan))  # YAML, too
-        (folder / f"{name}.yaml").write_text(json.dumps(
-            MACHINE | {"plan": f"{name}_plan.yaml", "noise_seed": len(name) + len(views) * 7 +
-                       (name == "two")}))
-        assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
-        if name != "again":
-            assert main(["solve", str(folder / name), "-o", str(folder / f"{name}.json"),
-                         "--quiet"]) == 0
-    return folder
-
-
-@pytest.fixture
-def said(folder, monkeypatch, capsys):
-    """Return a call of a verb in the folder: its output, and its code, 0 unless given."""
-    monkeypatch.chdir(folder)
-
-    def call(*words: str, code: int = 0) -> str:
-        assert main(list(words)) == code
-        return "".join(capsys.readouterr())
-
-    return call
+    plan = {"plan_id": "list", "artifact": {"marks": "marks.csv", "angular_count": 8},
+            "map": {"grid_size": 5}, "views": VIEWS}
+    return two_and_a_view(folder, plan, (38, 39, 12), **MACHINE)
 
 
 def test_plates_are_compared_and_maps_combined(said):
