@@ -9,8 +9,9 @@ estimated from the readings, the readings of all views have a normal likelihood 
 the plate: the errors of the marks, which they carry from view to view, show the right one. Each
 view has a free offset, rotation, strain and bending, which are not mistaken for another pose. The
 stage's errors are independent from site to site; at any pose they are a field as smooth as the
-nodes of the map are apart. Of images, the marks on the optical axis are compared. Of 1,000 clean simulated measurements on the lattice none was refused,
-and 200 wrongly placed plates were named.
+nodes of the map are apart. Of images, the marks on the optical axis are compared. Of
+1,000 clean simulated measurements on the lattice none was refused, and 200 wrongly placed plates
+were named.
 """
 
 from collections.abc import Iterator
