@@ -10,7 +10,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
+from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth, Waves
 from tools.reality.cases import (
     ARTIFACT,
     SETTINGS,
@@ -157,7 +157,23 @@ def _stages() -> list[Case]:
         *(_case(f"stage correlated over {length:g} pitches follows marks that lie {1e3 * away_m:g} "
                 "mm beside their sites", settings=replace(SERVO, follow_mark=True), t_m=away_m,
                 correlation_pitches=length)
-          for length, away_m in ((4, 1e-3), (4, 2e-3), (2, 2e-3)))]
+          for length, away_m in ((4, 1e-3), (4, 2e-3), (2, 2e-3))),
+        _case("encoders err by 30 nm in each 20 um", more={"change": subdivided(20e-6, 30e-9)}),
+        *(_case("encoders err by 30 nm in each 20 um, stage follows marks", phi,
+                settings=replace(SERVO, follow_mark=True),
+                more={"change": subdivided(20e-6, 30e-9)}) for phi in (0.003, 0.01, 0.03))]
+
+
+def subdivided(period_m: float, size_m: float) -> Change:
+    """Return a change: each linear encoder errs by a sine within its signal period."""
+    def change(truth: Truth, rng: np.random.Generator) -> Truth:
+        number = 2 * np.pi * truth.artifact.grid_pitch_m / period_m * np.eye(2)
+        size = np.diag(size_m * np.exp(2j * np.pi * rng.uniform(size=2)))
+        at_sites = np.real(size.sum(axis=0))  # a pitch is a number of whole periods
+        waves = Waves(np.concatenate([truth.waves.number, number]),
+                      np.concatenate([truth.waves.size, size]))
+        return replace(truth, waves=waves, g=truth.g + at_sites[:, None, None])
+    return change
 
 
 def _noises() -> list[Case]:
