@@ -12,7 +12,7 @@ from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
 ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
               "datum", "terms", "observability", "joint", "law", "verdict", "comparison",
-              "recheck", "api", "quality")
+              "recheck", "quality", "api")
 """The parts of estimation/: each imports only those before it."""
 
 MODULES_OF_A_FOLDER = 12

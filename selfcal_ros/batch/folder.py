@@ -104,15 +104,12 @@ class Settings:
     ----------
     collector, solver : CollectorSettings, SolverSettings
         Settings of the nodes.
-    robust : bool
-        Whether to search for outliers.
     namespace : str or None
         Namespace of the cell's topics, see `selfcal_ros.bagio.offline.collect_bag`.
     """
 
     collector: CollectorSettings
     solver: SolverSettings
-    robust: bool = False
     namespace: str | None = None
 
     def digest(self) -> str:

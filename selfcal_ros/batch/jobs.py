@@ -8,9 +8,7 @@ that a batch that was interrupted, moved or enlarged does only new work.
 import hashlib
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.batch import folder
@@ -20,7 +18,6 @@ from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model import result as results
-from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.verdict import finding_to_dict
 from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.summary.numbers import summary_numbers
@@ -74,13 +71,9 @@ def solved(job: folder.Job, source: dict[str, str],
     settings = job.settings
     session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
     options = solver_options(settings.solver, session.measurements)
-    solve: Callable[[Measurements, Any], results.CalibrationResult] = calibrate
-    if settings.robust:
-        from selfcal_ros.estimation.quality.outliers import robust_calibrate  # scipy.optimize
-        solve = robust_calibrate
     problem = None
     try:
-        result = worded(with_places(solve(session.measurements, options),
+        result = worded(with_places(calibrate(session.measurements, options),
                                     session.measurements.views))
     except NotIdentifiableError as error:
         if not isinstance(error.observability, results.Observability):

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
     baseline = read_result(args.baseline) if args.baseline else None
-    settings = Settings(*parameters(args), args.robust, args.namespace)
+    settings = Settings(*parameters(args), args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
         if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):

@@ -32,7 +32,7 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.outliers import clean
 from selfcal_ros.estimation.quality.validation import judged_by, validate
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.plate_form import with_nodes
@@ -70,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "misalignment_model",
           "uncertainty": "uncertainty"}
 REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
-TERMS = {"drift_degree": "drift_degree", "prior": "prior"}
+TERMS = {name: name for name in ("drift_degree", "prior", "robust")}
 SENSE = {"sense": "measurement_sense"}
 """Options for parameters of solver and collector -> their names."""
 
@@ -99,9 +99,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_parameters(parser, SolverSettings, TERMS)
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
-    parser.add_argument("--robust", action="store_true",
-                        help="find and remove outliers among the marks, name bad views "
-                        "(docs/identifiability.md)")
 
 
 def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
@@ -167,10 +164,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     measurements = _with_map(args, measurements)
     options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
-    for name in ("validate", "robust"):
-        if options.plate is not None and getattr(args, name):
-            raise InputError(f"--{name}", f"the plate is known from {options.plate_from}, and one "
-                             "view has nothing to check its readings against", "omit it")
+    if options.plate is not None and args.validate:
+        raise InputError("--validate", f"the plate is known from {options.plate_from}, and one "
+                         "view has nothing to check its readings against", "omit it")
     try:
         with busy("solving"):
             result = _calibrated(args, measurements, options)
@@ -212,8 +208,6 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
 def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
     """Return the result without sentences; errors of offsets or plate name the bag."""
     try:
-        if args.robust:
-            return robust_calibrate(measurements, options)
         return calibrate(measurements, options)
     except (WiringError, PlacingError) as error:
         raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
@@ -233,7 +227,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
     lines: list[str] = []
     result = with_places(result, measurements.views)
     if args.validate:
-        used = clean(measurements, options).measurements if args.robust else measurements
+        used = clean(measurements, options).measurements if options.robust else measurements
         found = validate(used, replace(options, prior=""))
         result = judged_by(result, found)
         result = replace(result, extra={

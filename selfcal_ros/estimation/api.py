@@ -27,6 +27,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import TermName, microscope_term
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
@@ -59,8 +60,10 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         If readings contradict the plan, an option does not fit them, the offsets do not follow the
         stage (`WiringError`), or the plate is not placed as planned (`PlacingError`).
     """
-    check_wiring(measurements)
     options = options or Options()
+    if options.robust:
+        return robust_calibrate(measurements, options)
+    check_wiring(measurements)
     _check_images(measurements, options)
     if options.plate is not None:
         if options.prior:
@@ -88,6 +91,47 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     from selfcal_ros.estimation.comparison.prior import with_prior  # likewise
 
     return with_prior(result, xy_covariance)
+
+
+def robust_calibrate(measurements: Measurements,
+                     options: Options | None = None) -> CalibrationResult:
+    """Calibrate without the readings that contradict the others.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        All readings.
+    options : Options, optional
+        As for `calibrate`; the method must be ``joint``.
+
+    Returns
+    -------
+    CalibrationResult
+        `findings` has what was found, ``extra["outliers"]`` lists the readings removed,
+        ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views; `rejected` counts the
+        removed detections under ``outlier_among_views``. A fault that could not be corrected
+        disqualifies the result.
+
+    Raises
+    ------
+    InputError
+        For Hu's law, which needs every reading, and for a known plate.
+    NotIdentifiableError
+        As `calibrate`.
+    """
+    from selfcal_ros.estimation.quality.outliers import LEFT, clean, listed  # rarely wanted
+
+    options = replace(options or Options(), robust=True)
+    check_wiring(measurements)
+    cleaned = clean(measurements, options)
+    result = calibrate(cleaned.measurements, replace(options, robust=False))
+    left = tuple(found for found in cleaned.findings if found.name in LEFT
+                 or found.details.get("spoils"))
+    verdict = result.verdict
+    if left:
+        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
+    return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
+                   extra={**result.extra, **listed(cleaned)})
 
 
 def _check_images(measurements: Measurements, options: Options) -> None:

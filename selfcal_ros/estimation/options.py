@@ -208,6 +208,8 @@ class Options:
     prior : str
         ``gp``: the map is the mean of a smooth random field given the readings, whose size and
         correlation length they show. Empty = that of the readings alone.
+    robust : bool
+        Whether to leave out readings that contradict the others, and to name bad views.
     plate : CalibrationResult, optional
         Calibration that made the plate known: its map is given, and the stage's is rechecked.
     plate_from : str
@@ -216,7 +218,7 @@ class Options:
     Raises
     ------
     InputError
-        For an unknown method or model.
+        For an unknown method or model, or if robust does not fit the others.
     """
 
     method: str = "joint"
@@ -232,6 +234,7 @@ class Options:
     at_places: bool = True
     magnification_limit: float = 1e-4
     prior: str = ""
+    robust: bool = False
     plate: CalibrationResult | None = None
     plate_from: str = ""
 
@@ -250,6 +253,12 @@ class Options:
         except ValueError as error:
             raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
                              known_are(str(self.datum_theta), ThetaDatum)) from error
+        if self.robust and self.method == "law":
+            raise InputError("robust", "Hu's law needs every reading and cannot leave any out",
+                             "solve with --method joint")
+        if self.robust and self.plate is not None:
+            raise InputError("robust", f"the plate is known from {self.plate_from}, and one view "
+                             "has nothing to check its readings against", "omit it")
 
     @property
     def finite_rotations(self) -> bool:

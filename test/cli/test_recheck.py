@@ -74,10 +74,11 @@ def test_a_stage_that_has_changed(folder, capsys):
     assert "Changed since r.json" in (folder / "bent.html").read_text()
 
 
-@pytest.mark.parametrize("option", ["--validate", "--robust"])
-def test_options_that_need_more_than_one_view(option, folder, capsys):
+@pytest.mark.parametrize(("option", "where"), [("--validate", "--validate"),
+                                               ("--robust", "robust")])
+def test_options_that_need_more_than_one_view(option, where, folder, capsys):
     assert main(["recheck", str(folder / "r.json"), str(folder / "same"), option]) == 2
-    assert f"{option}: the plate is known from {folder / 'r.json'}" in capsys.readouterr().err
+    assert f"{where}: the plate is known from {folder / 'r.json'}" in capsys.readouterr().err
 
 
 def test_a_recheck_knows_no_plate(folder, capsys):

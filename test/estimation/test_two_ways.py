@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality import prediction
-from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.outliers import clean
 from selfcal_ros.estimation.quality.residuals import noisy_views, residuals_of
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact

@@ -111,6 +111,19 @@ def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
         lost.take(views_of(replace(plan, artifact_from=str(tmp_path / "none.json"))))
 
 
+def test_the_robust_solver_leaves_out_a_reading_that_contradicts_the_others():
+    robust, plain = Desk(robust=True), Desk()
+    for desk in (robust, plain):
+        views = views_of()
+        views[1].dx[3] += 5e-6
+        desk.take(views)
+    assert [(item["view"], item["kind"]) for item in robust.session.result.extra["outliers"][
+        "removed"]] == [(PLAN.views[1].name, "grid")]
+    assert robust.session.result.verdict.qualified
+    assert not plain.session.result.verdict.qualified
+    assert "outliers" not in plain.session.result.extra
+
+
 def test_pictures_come_after_what_they_show(desk):
     desk.take(views_of())
     assert [name for name, _ in desk.hands.published] == ["map", "summary", "markers"]

@@ -17,8 +17,6 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -26,9 +24,8 @@ from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Key, Measurements, left_out, without
-from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm, TermName
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Finding
 
 OUTLIER_LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
@@ -91,63 +88,6 @@ class OutlierScreening:
     noisy: tuple[tuple[str, float], ...]
     unchecked: int
     findings: tuple[Finding, ...]
-
-
-def robust_calibrate(measurements: Measurements,
-                     options: Options | None = None) -> CalibrationResult:
-    """Calibrate without the readings that contradict the others.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        All readings.
-    options : Options, optional
-        As for `selfcal_ros.estimation.api.calibrate`; the method must be ``joint``.
-
-    Returns
-    -------
-    CalibrationResult
-        `findings` has what was found, ``extra["outliers"]`` lists the readings removed,
-        ``extra["slips"]`` and ``extra["noisy_views"]`` the bad views; `rejected` counts the
-        removed detections under ``outlier_among_views``. A fault that could not be corrected
-        disqualifies the result.
-
-    Raises
-    ------
-    InputError
-        For Hu's law, which needs every reading.
-    NotIdentifiableError
-        As `calibrate`.
-    """
-    options = options or Options()
-    if options.method != "joint":
-        raise InputError("--robust", "Hu's law needs every reading and cannot leave any out",
-                         "solve with --method joint")
-    check_wiring(measurements)
-    cleaned = clean(measurements, options)
-    result = calibrate(cleaned.measurements, options)
-    left = tuple(found for found in cleaned.findings if found.name in LEFT
-                 or found.details.get("spoils"))
-    verdict = result.verdict
-    if left:
-        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
-    return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
-                   extra={**result.extra, **_listed(cleaned)})
-
-
-def _listed(cleaned: OutlierScreening) -> dict[str, Any]:
-    """Return the tables of outliers, slips and noisy views for RESULT.json, SI units."""
-    removed = [{
-        "view": item.view, "kind": item.kind, "mark": list(item.mark),
-        "standardised": item.standardised, "leverage": item.leverage,
-        "residual_m": item.residual if item.kind == "grid" else None,
-        "residual_rad": item.residual if item.kind == "angular" else None,
-    } for item in cleaned.removed]
-    outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
-                        f"{OUTLIER_LEVEL}/n, for marks and lines together",
-                "unchecked": cleaned.unchecked, "removed": removed}
-    return {"outliers": outliers, "slips": [asdict(item) for item in cleaned.slips],
-            "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}
 
 
 @one_thread()
@@ -365,3 +305,18 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
         linear = flat[at] * problem.grid.poses[row].phase
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))
+
+
+def listed(cleaned: OutlierScreening) -> dict[str, Any]:
+    """Return the tables of outliers, slips and noisy views for RESULT.json, SI units."""
+    removed = [{
+        "view": item.view, "kind": item.kind, "mark": list(item.mark),
+        "standardised": item.standardised, "leverage": item.leverage,
+        "residual_m": item.residual if item.kind == "grid" else None,
+        "residual_rad": item.residual if item.kind == "angular" else None,
+    } for item in cleaned.removed]
+    outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
+                        f"{OUTLIER_LEVEL}/n, for marks and lines together",
+                "unchecked": cleaned.unchecked, "removed": removed}
+    return {"outliers": outliers, "slips": [asdict(item) for item in cleaned.slips],
+            "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}

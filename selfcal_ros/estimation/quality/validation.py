@@ -17,9 +17,8 @@ from selfcal_ros.errors import (
     NotIdentifiableError,
     NotSettledError,
 )
-from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess, turned_marks, turned_plate
 from selfcal_ros.estimation.lattice.readings import pose_of
@@ -123,7 +122,7 @@ def validate(measurements: Measurements, options: Options | None = None, *, seed
     # a pure datum: half axes that lose a mark would not do for xy_axes
     options = replace(options or Options(), method="joint", uncertainty=False, causes=False,
                       datum_theta=ThetaDatum.ZERO_MEAN)
-    calibrate(measurements, options)
+    fit_joint(measurements, options)  # refuses what cannot be solved as a whole
     rng = np.random.default_rng(seed)
     group = []
     for view in measurements.views:

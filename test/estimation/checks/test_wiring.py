@@ -10,7 +10,7 @@ from scipy.special import stdtr
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.collection.marks.repeats import repeat_motion
 from selfcal_ros.errors import ExitCode
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.checks.wiring import (
     WiringError,
     _p_of,
@@ -20,7 +20,6 @@ from selfcal_ros.estimation.checks.wiring import (
     worded,
 )
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View

@@ -15,12 +15,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint import pcg
 from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import in_datum, measured_in_datum, plan_of
 from test.support.options import BARE, bare

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint import fit as fitting
 from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes

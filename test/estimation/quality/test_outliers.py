@@ -9,9 +9,9 @@ from scipy.stats import binom
 from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.quality import residuals
-from selfcal_ros.estimation.quality.outliers import clean, robust_calibrate
+from selfcal_ros.estimation.quality.outliers import clean
 from selfcal_ros.estimation.quality.residuals import (
     angular_redundancy,
     by_repeats,

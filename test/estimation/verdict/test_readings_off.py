@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.outliers import robust_calibrate
 from selfcal_ros.estimation.verdict.off_sites import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
