@@ -160,13 +160,11 @@ class SolverSettings(ManagedSettings):
                                  "a view, if drift is a term", "", 1, MAX_DRIFT_DEGREE)
     prior: str = declared("none", "prior for the stage's map: gp = a smooth error, size and "
                           "correlation length from the readings", choices=("none", "gp"))
-    robust: bool = declared(False, "leave out readings that contradict the others, name bad views "
-                            "(docs/identifiability.md)")
+    robust: bool = declared(False, "leave out readings that contradict the others")
     save_path: str = declared("", "RESULT.json to write whenever the map changes; {run_id} in it "
                               "is replaced by the run; empty = none")
-    result_folder: str = declared(
-        "", "folder in which save_map may write, and to which paths are relative; empty = the "
-        "working directory")
+    result_folder: str = declared("", "folder in which save_map may write, and to which paths are "
+                                  "relative; empty = the working directory")
 
 
 @dataclass(frozen=True)
