@@ -34,9 +34,13 @@ PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTIO
 """Reasons possibly caused by a stage away from all marks."""
 
 Span = tuple[int, int] | None
+NEARLY_ALL = 0.9
+"""Fraction of the marks at whose sites the stage stands if their stamps alone are wrong."""
 STOPPED = 20
 """Number of the last marks of a view at all of which a stage that no longer moves is indicated at
 one place."""
+LATE = 50
+"""Largest number of exposures between which stamps of the wrong time are recognised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +185,9 @@ def _seconds(offset_s: float) -> str:
 
 def _stage(e: Evidence) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
-    stopped = _stopped(e)
-    if stopped:
-        return stopped
+    elsewhen = _at_another_time(e) or _stopped(e)
+    if elsewhen:
+        return elsewhen
     joints = wrong_joints(e) if e.joints else None
     if e.lies and len(e.marks) == 1:
         return "; or, if it lies as planned: ".join(filter(None, (e.lies, joints)))
@@ -200,6 +204,23 @@ def _stage(e: Evidence) -> str | None:
     check = "joint_x and joint_y, " if e.joints else ""
     return (f"the stage stands {away:.3g} m from the sites of the detected marks (median); "
             f"check {check}the ids of the marks and how the plate lies")
+
+
+def _at_another_time(e: Evidence) -> str | None:
+    """Return that the stage was at the marks some exposures before or after their stamps."""
+    if not _away(e, lambda stage: stage) > e.limit_m:
+        return None
+    half = sum(len(view.sites) for view in e.marks) / 2
+    for steps, late in product(range(1, LATE + 1), (True, False)):
+        at, of = (slice(None, -steps), slice(steps, None))[::1 if late else -1]
+        apart = np.concatenate([np.abs(view.stage[at] + view.cells[of] - view.sites[of])
+                                for view in e.marks])
+        if len(apart) >= half and np.quantile(apart, NEARLY_ALL) * e.pitch_m <= e.limit_m:
+            exposures = "1 exposure" if steps == 1 else f"{steps} exposures"
+            return (f"at the stamp of a mark the stage stands where the mark {exposures} "
+                    f"{'later' if late else 'earlier'} is seen; stamp detections and encoder "
+                    "samples with the time of the exposure, by one clock")
+    return None
 
 
 def _stopped(e: Evidence) -> str | None:

@@ -220,6 +220,20 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     assert "of the last 20 marks; check the encoder and what publishes its joints" in found
 
 
+@pytest.mark.parametrize("sense", list(Sense))
+@pytest.mark.parametrize(("exposures", "where"), [
+    (1, "the mark 1 exposure later"), (3, "the mark 3 exposures later"),
+    (-2, "the mark 2 exposures earlier")])
+def test_stamps_of_another_exposure(exposures, where, sense):
+    cell = scene(count=0, repeats=3, sense=sense)
+    step = cell.detections[1].stamp_ns - cell.detections[0].stamp_ns
+    for index, detection in enumerate(cell.detections):
+        cell.spoil(index, stamp_ns=detection.stamp_ns + exposures * step)
+    found = findings(cell.events, measurement_sense=str(sense))[None]
+    assert f"stage_not_at_mark: at the stamp of a mark the stage stands where {where} is " in found
+    assert found.endswith("with the time of the exposure, by one clock")
+
+
 @pytest.mark.parametrize(("positions", "said"), [
     ((), "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample came "
      "that can be used, {} were rejected as encoder_sample_malformed; give each name of a joint "

@@ -297,7 +297,8 @@ def worded(fault: WiringFault) -> WiringError:
     elif any(response.slope > 0 for response in responses):
         what = "offsets of the other sign: " + names + (
             " rise" if len(responses) > 1 else " rises") + " where the optical axis moves on"
-        remedy = f"publish mark - optical axis: reverse the sign of {names}"
+        remedy = (f"publish mark - optical axis: reverse the sign of {names}; or, if it is right, "
+                  "stamp the detections with the time of the exposure")
     else:
         what = f"offsets in wrong units: {names} " + ", ".join(
             f"{abs(r.slope):.3g}" for r in responses) + " times what the stage moves"
