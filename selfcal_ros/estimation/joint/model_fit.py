@@ -31,7 +31,6 @@ from selfcal_ros.estimation.terms.projection import (
     project,
     reduce_anew,
     reduce_columns,
-    reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
@@ -84,8 +83,6 @@ class ModelFit:
         Equations of the terms; None without terms.
     coefficients : float array (p,)
         Of the terms' columns.
-    sums : Sums
-        What is left of the readings, and its degrees of freedom.
     y : complex array (views, nx, ny)
         Deviations as the last linear step took them.
     reduced : ReducedColumns or None
@@ -99,7 +96,6 @@ class ModelFit:
     found: JointFit
     equations: TermEquations | None
     coefficients: np.ndarray
-    sums: Sums
     y: np.ndarray
     reduced: ReducedColumns | None = None
     sizes: tuple[SizeTest, ...] = ()
@@ -178,9 +174,10 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
         reduced = reduce_columns(problem.system.grid, columns.shapes)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
     known = list(filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals)))
-    lines = reduce_lines(problem.system.angular, columns.lines, found.ratio, problem.half_width_m)
-    return TermEquations(problem.system, columns, project(problem.system, reduced, inverse, lines),
-                         min(known, default=0.0), found.ratio * problem.half_width_m**2)
+    projected = project(problem.system, reduced, inverse, columns.lines, ratio=found.ratio,
+                        half_width_m=problem.half_width_m)
+    return TermEquations(problem.system, columns, projected, min(known, default=0.0),
+                         found.ratio * problem.half_width_m**2)
 
 
 class _State:
@@ -203,7 +200,6 @@ class _State:
             self._linearise(columns, reduce_columns(problem.system.grid, columns.shapes))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
-        self.sums = self._sums()
 
     def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
@@ -279,9 +275,8 @@ class _State:
         equations, reduced = self.equations, self.reduced
         if equations is not None and reduced is not None and self._stale(equations):
             self._linearise(equations.columns, reduced)
-        self.sums = self._sums()
         problem = replace(self.problem, ground=self.moving.ground(self.found))
-        return ModelFit(problem, self.found, self.equations, self.coefficients, self.sums, self.y,
+        return ModelFit(problem, self.found, self.equations, self.coefficients, self.y,
                         self.reduced)
 
     def _solve_terms(self, equations: TermEquations) -> None:
@@ -323,13 +318,6 @@ class _State:
         return (turn - 1j * phi) * (grid.views.z * length) + turn * (
             self.found.plate + self._of_terms(OF_PLATE)) + frame * (
                 grid.views.gather(self.found.field) + self._of_terms((TermName.APPROACH,)))
-
-    def _sums(self) -> Sums:
-        if self.equations is not None:
-            now = score(self.equations, self.found.both_residuals,
-                        squares(self.problem, self.found), coefficients=self.coefficients)
-            return residual_sums(self.equations, now)
-        return Sums(*squares(self.problem, self.found), float("nan"), 0)
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:

@@ -20,7 +20,6 @@ from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
     project,
     reduce_columns,
-    reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import WithinMarks
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
@@ -157,9 +156,8 @@ def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterab
     if len(columns.lines.at):
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
         inverse = system.inverse(ratio)
-    lines = reduce_lines(system.angular, columns.lines, ratio, length)
-    return TermEquations(system, columns, project(system, reduced, inverse, lines),
-                         assumed.sigma_m, ratio * length**2)
+    projected = project(system, reduced, inverse, columns.lines, ratio=ratio, half_width_m=length)
+    return TermEquations(system, columns, projected, assumed.sigma_m, ratio * length**2)
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
