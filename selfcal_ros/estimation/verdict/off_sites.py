@@ -79,8 +79,9 @@ def slip_columns(made: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
     for view, visits in enumerate(made.ground.visits):
         if visits is None:
             continue
+        rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
         for part in (np.arange(1, PLACES + 1) / (PLACES + 1)).tolist():
-            after = _after(visits, part)
+            after = rank >= round(part * len(rank))
             if 3 <= after.sum() <= len(after) - 3:
                 at = made.ground.z.reshape(-1)[visits.mark]
                 yield add_slip(made, view, (after * visits.phase, after * at), visits), view, part
@@ -110,12 +111,6 @@ def add_slip(made: ColumnBuilder, view: int, values: tuple[np.ndarray, np.ndarra
         for text, unit in parts:
             made.column(Column(SLIP, view, text, np.inf), shape, unit)
     return range(len(made.columns) - 3, len(made.columns))
-
-
-def _after(visits: ViewVisits, part: float) -> np.ndarray:
-    """Return a mask of the visits after the first `part` of them in time, bool (V,)."""
-    rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
-    return rank >= round(part * len(rank))
 
 
 OFF_SITES = "off_sites"
