@@ -221,15 +221,6 @@ def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
     return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
 
 
-def kept_images(artifact: Artifact, views: Sequence[View], noises: TwoNoises) -> dict[str, Any]:
-    """Return what a result keeps of the noise of images in its grid views, see `KEY`."""
-    seen = cells_seen(artifact, views) or ()
-    names = list(dict.fromkeys(name for name, _ in seen))
-    return {KEY: {"share": noises.share, "dof_mark": noises.dof_mark,
-                  "placing": [names.index(name) for name, _ in seen],
-                  "step": [list(step) for _, step in seen]}}
-
-
 def share_of(result: CalibrationResult) -> float:
     """Return the part of the variance of a reading that the marks of an image share; 0 without."""
     return _kept_number(result, "share", 1.0)

@@ -20,7 +20,6 @@ from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
-    Sums,
     TermEquations,
     next_coefficients,
     residual_sums,
@@ -283,7 +282,10 @@ class _State:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
         sums = residual_sums(equations, now)
-        self.problem = with_noise(self.problem, sums)
+        self.problem = replace(
+            self.problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
+            repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
+            else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
         self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
         lines = equations.columns.lines
@@ -336,11 +338,3 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
     return total, dof
-
-
-def with_noise(problem: Problem, sums: Sums) -> Problem:
-    """Return the problem with the noises of residuals and visits after the terms."""
-    within = sums.dof_within >= 1
-    repeats = sigma_of(sums.within, sums.dof_within) if within else problem.repeats_xy
-    return replace(problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
-                   repeats_xy=repeats)
