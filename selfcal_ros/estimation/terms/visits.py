@@ -100,24 +100,6 @@ def squares_within(visits: Iterable[ViewVisits | None]) -> float:
     return total
 
 
-def approach_sign(sense: Sense) -> int:
-    """Return the sign of the indicated position in a reading: -1 where the plate moves."""
-    return -1 if sense is Sense.PLATE_MOVES else 1
-
-
-def visits_of(measurements: Measurements, grid: GridData,
-              placings: Sequence[int]) -> tuple[ViewVisits | None, ...]:
-    """Return the visits of every grid view, in the order of `grid`; None if unknown.
-
-    The time is that of the placing to which a view belongs, see `TermInputs`.
-    """
-    views = [measurements.views[i] for i in grid.index]
-    ranges = time_ranges(views, placings)
-    return tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
-                            measurements.artifact.flat(view.m, view.n))
-                 for row, view in enumerate(views))
-
-
 def time_ranges(views: Iterable[ViewReadings],
                 placings: Iterable[int]) -> dict[int, tuple[int, int]]:
     """Return the first and the last instant of each placing, ns, that has visits."""
@@ -132,7 +114,10 @@ def time_ranges(views: Iterable[ViewReadings],
 
 def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None,
                flat: np.ndarray) -> ViewVisits | None:
-    """Return the visits of a view whose marks have the indices `flat` (P,)."""
+    """Return the visits of a view whose marks have the indices `flat` (P,); None if unknown.
+
+    `ends` are those of the time of the placing to which it belongs, see `TermInputs`.
+    """
     visits = view.visits
     if visits is None or not len(visits.mark) or ends is None:
         return None
@@ -149,26 +134,24 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, in
 def check_visits(measurements: Measurements) -> None:
     """Raise InputError for invalid visits: of no mark, or not finite."""
     for view in measurements.views:
-        if view.visits is not None and len(view.visits.mark):
-            _check(view.visits, view)
-
-
-def _check(visits: GridVisits, view: ViewReadings) -> None:
-    where, number = f"view '{view.view.name}' visits of grid marks", len(visits.mark)
-    columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
-               visits.offset_y, visits.approach_x, visits.approach_y)
-    if any(len(column) != number for column in columns):
-        raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches differ "
-                         "in length", "give one value per visit")
-    if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
-        raise InputError(where, "a visit belongs to none of the marks that were read",
-                         "number the marks as `m` and `n` have them")
-    if visits.count.min() < 1:
-        raise InputError(where, "a count below 1", "leave out visits without a reading")
-    for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
-        if not (np.abs(values) < FARTHEST_M).all():
-            raise InputError(where, "a deviation or offset is not a finite number, or no length "
-                             "of a stage", "remove the visit")
+        visits = view.visits
+        if visits is None or not len(visits.mark):
+            continue
+        where = f"view '{view.view.name}' visits of grid marks"
+        columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
+                   visits.offset_y, visits.approach_x, visits.approach_y)
+        if any(len(column) != len(visits.mark) for column in columns):
+            raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches "
+                             "differ in length", "give one value per visit")
+        if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
+            raise InputError(where, "a visit belongs to none of the marks that were read",
+                             "number the marks as `m` and `n` have them")
+        if visits.count.min() < 1:
+            raise InputError(where, "a count below 1", "leave out visits without a reading")
+        for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
+            if not (np.abs(values) < FARTHEST_M).all():
+                raise InputError(where, "a deviation or offset is not a finite number, or no "
+                                 "length of a stage", "remove the visit")
 
 
 def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
@@ -292,10 +275,15 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = maps_of(grid.y.shape[1:], grid.poses).z
-    views = [measurements.views[i].view for i in grid.index]
+    readings = [measurements.views[i] for i in grid.index]
+    views = [view.view for view in readings]
     placings = placings_of(views)
-    return TermInputs(z, half_width_m, grid.weight, visits_of(measurements, grid, placings),
-                      tuple(view.name for view in views), approach_sign(measurements.sense),
+    ranges = time_ranges(readings, placings)
+    visits = tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
+                              measurements.artifact.flat(view.m, view.n))
+                   for row, view in enumerate(readings))
+    return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
+                      -1 if measurements.sense is Sense.PLATE_MOVES else 1,
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
