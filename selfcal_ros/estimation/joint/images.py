@@ -18,7 +18,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.terms.equations import UNTOLD
-from selfcal_ros.estimation.terms.yaw import StageYaw
+from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations

@@ -22,8 +22,7 @@ from selfcal_ros.estimation.terms.projection import (
     reduce_columns,
 )
 from selfcal_ros.estimation.terms.shapes import WithinMarks
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
-from selfcal_ros.estimation.terms.yaw import stage_yaw
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
