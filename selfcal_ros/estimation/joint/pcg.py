@@ -209,7 +209,8 @@ def missing_mark_correction(grid: GridSystem) -> np.ndarray:
     correction keeps the number of steps from growing with the number of missing marks.
     """
     views = grid.views
-    full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)
+    mean = float(grid.weight.sum() / max(grid.n_readings, 1))
+    full = GridSystem(views.poses, views.in_field * mean, views.unit)
     now, then = (views.scatter_weight(one.weight * (1 - one.relative_weight))
                  for one in (grid, full))
     good = (now > 0) & (then > 0)
