@@ -153,18 +153,13 @@ def _best(found: list[SlipPlace], measurements: Measurements, options: Options) 
     order = np.argsort(losses, kind="stable")
     slip, squares, size = fits[order[0]]
     # the loss counts residuals, which are smaller than the noise by the part that the fit follows
-    dof_part = 1 - _followed(measurements, slip, options)
+    system = prepare(split_view(measurements, slip), options)[0].system
+    dof_part = 1 - system.rank_grid / (2 * system.grid.n_readings)
     near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
     others = tuple(fits[i][0] for i in order[1:] if losses[i] < near)
     tx_m, ty_m, phi_rad = size
     return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
                 others)
-
-
-def _followed(measurements: Measurements, slip: SlipPlace, options: Options) -> float:
-    """Return the mean leverage after the split."""
-    system = prepare(split_view(measurements, slip), options)[0].system
-    return system.rank_grid / (2 * system.grid.n_readings)
 
 
 def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
