@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.scale import scale_of, scale_of_plate
+from selfcal_ros.estimation.datum.covariance import scale_of, scale_of_plate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
     AngularPart,

@@ -20,8 +20,7 @@ from selfcal_ros.estimation.datum.angular import (
     conditions_for,
     misclosure_test,
 )
-from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.datum.scale import scale_of
+from selfcal_ros.estimation.datum.covariance import MapsCovariance, scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import noise_gain
 from selfcal_ros.estimation.joint.images import KEY, cells_seen, image_noise

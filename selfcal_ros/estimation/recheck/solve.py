@@ -11,7 +11,6 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -26,6 +25,7 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.joint.solve import views_of
 from selfcal_ros.estimation.joint.solved import noise_of
+from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
