@@ -64,7 +64,9 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if options.robust:
         return robust_calibrate(measurements, options)
     check_wiring(measurements)
-    _check_images(measurements, options)
+    if options.method == "law" and measurements.has_images:  # their common noise is not in its U
+        raise InputError("method law", "Hu's law cannot use images of several marks",
+                         "solve with --method joint")
     if options.plate is not None:
         if options.prior:
             raise InputError("prior", f"the plate is known from {options.plate_from}",
@@ -72,7 +74,11 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         plate = known_plate(options.plate, options.plate_from)
         return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
-    options = options if camera is None else _knowing(camera, options)
+    if camera is not None:  # the microscope that images show, in place of the assumed one
+        (scale, turn), other = camera.u_coefficients[1:3]
+        known = microscope_term(float(scale), float(turn), float(other.max()))
+        options = replace(options, assumed=tuple(
+            known if term.name is TermName.MICROSCOPE else term for term in options.assumed))
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
     solved = judged(solved, measurements, options)
     result = solved.result
@@ -81,7 +87,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     shown = {} if camera is None else camera.to_dict()
     if solved.model is not None and measurements.has_images:
         yaw = yaw_of(solved.model, measurements.sense)
-        shown |= {} if yaw is None else {"yaw": yaw.to_dict()}
+        shown |= {} if yaw is None else {"yaw": yaw}
     result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
     if measurements.has_images:
         result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
@@ -134,13 +140,6 @@ def robust_calibrate(measurements: Measurements,
                    extra={**result.extra, **listed(cleaned)})
 
 
-def _check_images(measurements: Measurements, options: Options) -> None:
-    """Refuse images of several marks where their common noise would be missing in U."""
-    if options.method == "law" and measurements.has_images:
-        raise InputError("method law", "Hu's law cannot use images of several marks",
-                         "solve with --method joint")
-
-
 def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurements:
     """Return readings of a known plate corrected by the camera of its calibration."""
     if not measurements.has_images:
@@ -166,13 +165,6 @@ def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None
             return None, measurements
         straight = straightened(measurements, camera)
     return camera, straight
-
-
-def _knowing(camera: Camera, options: Options) -> Options:
-    """Return the options with the microscope shown by images in place of the assumed one."""
-    known = microscope_term(*camera.u_linear)
-    return replace(options, assumed=tuple(
-        known if term.name is TermName.MICROSCOPE else term for term in options.assumed))
 
 
 def pure_noise(marks: int) -> Measurements:

@@ -93,8 +93,7 @@ class _Seen:
 
 def check_placing(measurements: Measurements) -> None:
     """Raise PlacingError if the plate is not placed as planned in a view."""
-    found = misplaced(measurements)
-    if found:
+    if found := misplaced(measurements):
         raise said(found, f"plan '{measurements.plan_id}', ")
 
 
@@ -134,17 +133,12 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
     return Misplaced.of(view.plan_view, before, pose, gain)
 
 
-def other_poses(pose: StagePose) -> Iterator[Any]:
-    """Yield other poses of a plate, of the same kind: turned, shifted differently, not at all."""
+def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
+    """Yield other poses of a plate on the lattice: turned, shifted differently, not at all."""
     a, b = pose.shift
-    if isinstance(pose, LatticePose):
-        yield from (replace(pose, quarter_turns=q) for q in range(4) if q != pose.q)
-    elif isinstance(pose, PlacedPose):
-        turns = (1, pose.phase.conjugate(), *(pose.phase * turn for turn in (1j, -1, -1j)))
-        yield from (replace(pose, phase=turn) for turn in turns if turn != pose.phase)
+    yield from (replace(pose, quarter_turns=q) for q in range(4) if q != pose.q)
     beside = {(0, 0), (-a, -b), (b, a), (-b, -a), (a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)}
-    for shift in sorted(beside - {pose.shift}):
-        yield replace(pose, shift=shift)  # type: ignore[type-var]
+    yield from (replace(pose, shift=shift) for shift in sorted(beside - {pose.shift}))
 
 
 def _poses(seen: _Seen, artifact: Artifact) -> Iterator[Any]:

@@ -158,9 +158,7 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
         Variance of these values within each run.
     """
     def excess(variance: float) -> float:
-        weight = 1 / np.maximum(within + variance, TINY)
-        rest = squares - weight @ squares / weight.sum()
-        return float((weight @ rest**2).mean()) - (len(within) - 1)
+        return _scatter(squares, within + variance) - (len(within) - 1)
 
     high = float(((squares - squares.mean(axis=0)) ** 2).sum(axis=0).mean())
     if not high > 0 or excess(0.0) <= 0:
@@ -172,9 +170,19 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
     return high
 
 
+def _scatter(squares: np.ndarray, within: np.ndarray) -> float:
+    """Return the scatter of values about their weighted means, over their variances."""
+    weight = 1 / np.maximum(within, TINY)
+    rest = squares - weight @ squares / weight.sum()
+    return float((weight @ rest**2).mean())
+
+
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """Amplitudes of the shapes and the rest of every run, and their variances."""
+    """Amplitudes of the shapes and the rest of every run, and their variances.
+
+    The rest as that of independent values: `n_rest` of d values are.
+    """
 
     shapes: np.ndarray
     amplitude: np.ndarray
@@ -192,7 +200,8 @@ def _parts(values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray,
     n_rest = len(known) - known.shape[1]
     within = np.stack([_power(c, shapes) for c in covariances])
     total = np.array([_diagonal(c).sum() for c in covariances])
-    return _Parts(shapes, amplitude, within, values - amplitude @ shapes.T,
+    scale = np.sqrt(values.shape[1] / max(n_rest, 1))
+    return _Parts(shapes, amplitude, within, (values - amplitude @ shapes.T) * scale,
                   np.maximum(total - within.sum(axis=1), 0.0) / max(n_rest, 1),
                   np.maximum(1 - (known**2).sum(axis=1), 0.0), n_rest)
 
@@ -201,10 +210,7 @@ def _variances_between(parts: _Parts) -> tuple[np.ndarray, float]:
     """Return the variance between runs of each shape's amplitude, and of each value left."""
     of_shapes = np.array([variance_between(parts.amplitude[:, [m]], parts.within[:, m])
                           for m in range(parts.shapes.shape[1])])
-    if not parts.n_rest:
-        return of_shapes, 0.0
-    scale = np.sqrt(parts.rest.shape[1] / parts.n_rest)  # n_rest of d values are independent
-    return of_shapes, variance_between(parts.rest * scale, parts.rest_within)
+    return of_shapes, variance_between(parts.rest, parts.rest_within) if parts.n_rest else 0.0
 
 
 def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
@@ -261,18 +267,11 @@ def _p_between(parts: _Parts, runs: list[Run], own: list[np.ndarray]) -> float:
     """Return the probability of the scatter between runs by chance: the worst shape, Bonferroni."""
     dof = _noise_dof(runs, own, np.ones(len(runs)))
     k = len(runs) - 1
-
-    def scatter(squares: np.ndarray, within: np.ndarray) -> float:
-        weight = 1 / np.maximum(within, TINY)
-        rest = squares - weight @ squares / weight.sum()
-        return float((weight @ rest**2).mean()) / k
-
-    found = [float(fdtrc(k, dof, scatter(parts.amplitude[:, [m]], parts.within[:, m])))
+    found = [float(fdtrc(k, dof, _scatter(parts.amplitude[:, [m]], parts.within[:, m]) / k))
              for m in range(parts.shapes.shape[1])]
     if parts.n_rest:
         number = min(_independent_number(_sum(own, np.ones(len(own)))), parts.n_rest)
-        scale = np.sqrt(parts.rest.shape[1] / parts.n_rest)
-        found.append(float(fdtrc(k * number, dof, scatter(parts.rest * scale, parts.rest_within))))
+        found.append(float(fdtrc(k * number, dof, _scatter(parts.rest, parts.rest_within) / k)))
     return min(1.0, len(found) * min(found, default=1.0))
 
 

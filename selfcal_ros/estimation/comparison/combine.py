@@ -23,9 +23,9 @@ from selfcal_ros.estimation.comparison.runs import (
     require_own_readings,
     shared_reference,
 )
-from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
+from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.verdict.uncertainty import (
     INTERPOLATION,

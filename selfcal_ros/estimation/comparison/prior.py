@@ -17,8 +17,8 @@ from scipy.linalg import cho_factor, cho_solve, null_space
 from scipy.special import chdtri, fdtrc
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.solved import KEY, factors_of
+from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import PRIORS
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines

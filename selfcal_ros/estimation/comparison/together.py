@@ -23,9 +23,9 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult

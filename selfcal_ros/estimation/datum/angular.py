@@ -199,8 +199,12 @@ class LinesCovariance:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
         rows = conditions.rows.T
         misclosure = -rows, np.zeros(rows.shape), self.cover.functionals(conditions.slopes)
-        closure, y = self.of(*misclosure), self.angular.response
-        own = self._theta2 * self._inverse_diagonal() + np.einsum("ka,ab,kb->k", y, self._phi, y)
+        closure, y, n = self.of(*misclosure), self.angular.response, self.angular.n_lines
+        inverse = np.concatenate([self.angular.solve(np.eye(n, len(here), -here[0]))[
+            here, here - here[0]] for here in self._blocks()])
+        phi = self.cover.inverse[np.ix_(self.system.phi_at, self.system.phi_at)] * (
+            self._xy2 / self.cover.length**2)
+        own = self._theta2 * inverse + np.einsum("ka,ab,kb->k", y, phi, y)
         own += np.einsum("kp,pq,kq->k", self.terms[0], self._of_terms, self.terms[0])
         spread = self._spread(*misclosure)[0]
         variance = own + _by(conditions.gain, closure, spread)
@@ -286,20 +290,9 @@ class LinesCovariance:
         """Covariance of the coefficients of the terms, (p, p)."""
         return self.cover.terms.covariance * self._xy2
 
-    @property
-    def _phi(self) -> np.ndarray:
-        """Covariance of the rotations of the angular views, rad^2."""
-        at = np.ix_(self.system.phi_at, self.system.phi_at)
-        return self.cover.inverse[at] * (self._xy2 / self.cover.length**2)
-
     def _blocks(self) -> list[np.ndarray]:
         n = self.angular.n_lines
         return [np.arange(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
-
-    def _inverse_diagonal(self) -> np.ndarray:
-        n = self.angular.n_lines
-        return np.concatenate([self.angular.solve(np.eye(n, len(here), -here[0]))[
-            here, here - here[0]] for here in self._blocks()])
 
 
 def _by(fields: np.ndarray, inner: np.ndarray, spread: np.ndarray) -> np.ndarray:

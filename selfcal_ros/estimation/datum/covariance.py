@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance of the maps of stage and plate in their datum.
+"""Covariance of the maps of stage and plate in their datum, and the scale of both.
+
+No view determines the magnification: G = s z, A = -s m with offsets to match changes no reading.
+With a reference the maps in their datum (no scale) become G + c z and A - c m, with c such that the
+reference holds (method eq. 3.5).
 
 For unit noise the sites have the covariance S = M^-1 + Y P Y', with M the eliminated matrix,
 Y its answer to the misalignments and P their covariance (method eq. 4.8). With the plate
@@ -17,22 +21,70 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
 
-from selfcal_ros.estimation.datum.scale import scale_rows
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.lattice.placed import PlacedViews
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.normal.placed import PlacedSystem
 from selfcal_ros.estimation.normal.systems import Marks, system_of
-from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.pose import LatticePose
 
 NO_NOISE_M = 1e-100
 """Stands for zero noise; its square is still representable."""
 
-BLOCK = 1024
-"""Number of marks computed at once."""
+
+def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
+             plate: np.ndarray, half_width_m: float) -> float:
+    """Return c for a map and a plate in their datum, m at the unit of position."""
+    value = reference.relative_error * half_width_m
+    if not reference.kind.of_plate:
+        return value - float(np.real(_slope(system, reference.kind).conj() @ field.ravel()))
+    return float(np.real(np.vdot(scale_of_plate(system, reference), plate))) - value
+
+
+def scale_rows(system: NormalEquations, reference: ReferenceLength
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return c as functionals of both maps in their datum, complex (sites, 1) and (marks, 1)."""
+    sites = np.zeros((system.grid.n_sites, 1), dtype=complex)
+    marks = np.zeros((system.grid.n_marks, 1), dtype=complex)
+    if reference.kind.of_plate:
+        marks[:, 0] = scale_of_plate(system, reference).reshape(-1)
+    else:
+        sites[:, 0] = -_slope(system, reference.kind)
+    return sites, marks
+
+
+def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.ndarray:
+    """Return the row of the plate's map that is its scale, complex (nx, ny).
+
+    That of the distance of two marks if the reference is one, else the least-squares scale.
+
+    Raises
+    ------
+    InputError
+        If one of the two marks was not measured.
+    """
+    z, known = system.grid.views.z, system.known_marks
+    if reference.marks is None:
+        return Gauge(z, known, scale=True).dual(3)
+    first, second = (system.grid.views.index_of(*mark) for mark in reference.marks)
+    for mark, at in zip(reference.marks, (first, second), strict=True):
+        if not known[at]:
+            raise InputError("reference length", f"the mark {mark} was not measured",
+                             "measure it, or take another reference")
+    apart, row = z[second] - z[first], np.zeros(z.shape, dtype=complex)
+    row[second], row[first] = (sign * apart / abs(apart) ** 2 for sign in (1, -1))
+    return row
+
+
+def _slope(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
+    """Return the row of the slope of Gx on x, or Gy on y, over the known sites, (sites,)."""
+    z, known = system.grid.views.z_sites, system.known_sites
+    along, unit = (z.real, 1) if kind is ReferenceKind.STAGE_X else (z.imag, 1j)
+    centred = np.where(known, along - along[known].mean(), 0.0)
+    return (unit * centred / (centred**2).sum()).ravel()
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +218,8 @@ class MapsCovariance:
     def of_plate(self) -> np.ndarray:
         """Variances of Ax and Ay at every mark, (2, nx, ny); NaN if unknown."""
         system, (fields, g, a) = self.system, self._datum(plate=True)
-        variance = self._of_marks(fields, g, a) if isinstance(
-            system.grid.views, PlacedViews) else self._exchanged()._of_sites(fields, a, g)
+        variance = self._of_marks(system.grid, fields, g, a) if isinstance(
+            system.grid, PlacedSystem) else self._exchanged()._of_sites(fields, a, g)
         variance = variance + self._of_length(system.grid.views.z)
         return np.where(system.known_marks, variance.reshape(2, *system.known_marks.shape), np.nan)
 
@@ -278,14 +330,15 @@ class MapsCovariance:
         return self._in_datum(grid.factor.inverse_diagonal(), grid.response, self.terms.fields,
                               field - self.terms.fields @ taken, fields, self.of_free(g, a))
 
-    def _of_marks(self, fields: np.ndarray, g: np.ndarray, a: np.ndarray) -> np.ndarray:
+    def _of_marks(self, grid: PlacedSystem, fields: np.ndarray, g: np.ndarray,
+                  a: np.ndarray) -> np.ndarray:
         """Return the variances of the plate's map, for views off the lattice, (2, marks)."""
-        grid, plates = self.system.grid, self.terms.plates
+        plates = self.terms.plates
         field, parameters, taken = self._solved(g, a)
         spread = self._plates(field, parameters) + self._noise[:, None] * a - plates @ taken
         answer = self._plates(-grid.response, np.eye(len(self._p)))
-        return self._in_datum(self._noise + _of_nodes(grid), answer, plates, spread, fields,
-                              self.of_free(g, a))
+        return self._in_datum(self._noise + grid.variance_of_means(), answer, plates, spread,
+                              fields, self.of_free(g, a))
 
     def _in_datum(self, own: np.ndarray, answer: np.ndarray, terms: np.ndarray, spread: np.ndarray,
                   fields: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -334,22 +387,3 @@ class MapsCovariance:
         return MapsCovariance(other, move @ self._p @ move.T, terms=TermSpread(
             terms.columns, terms.lines, terms.plates, terms.fields, move @ self._moved,
             terms.turned, terms.covariance))
-
-
-def _of_nodes(grid: GridSystem) -> np.ndarray:
-    """Return the variance of the mean of the stage errors at the sites of each mark, (marks,)."""
-    views = grid.views
-    if not isinstance(views, PlacedViews):
-        raise TypeError("only for views off the lattice")
-    rows = csr_matrix((grid.n_marks, grid.n_sites), dtype=complex)
-    for one, phase, part in zip(views.rows, views.phases, grid.relative_weight, strict=True):
-        rows = rows + diags(part.ravel() * phase.conjugate()) @ one
-    inverse = grid.factor.inverse.reshape(grid.n_sites, *views.shape)
-    half = views.spline.coefficients(inverse).reshape(grid.n_sites, -1)
-    cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
-        grid.n_sites, -1)
-    out = np.zeros(grid.n_marks)
-    for start in range(0, grid.n_marks, BLOCK):
-        here = rows[start:start + BLOCK]
-        out[start:start + BLOCK] = np.real(here.conj().multiply(here @ cover).sum(axis=1)).ravel()
-    return out

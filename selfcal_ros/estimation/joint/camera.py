@@ -15,7 +15,6 @@ from scipy.special import fdtrc
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
-from selfcal_ros.estimation.joint.noise_effects import sensitivities_of_terms
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.pose import Image
@@ -102,12 +101,6 @@ class Camera(Distortion):
     noise_image: float
     noise_mark: float
 
-    @property
-    def u_linear(self) -> tuple[float, float, float]:
-        """Standard uncertainties of scale, rotation, and the larger of stretch and shear."""
-        (scale, turn), other = self.u_coefficients[1], self.u_coefficients[2]
-        return float(scale), float(turn), float(other.max())
-
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form, ``camera`` in RESULT.json."""
         scale, shear = self.coefficients[1:3]
@@ -124,13 +117,10 @@ class Camera(Distortion):
                 {"power": list(power), "x": value.real, "y": value.imag, "u_x": u[0], "u_y": u[1]}
                 for power, value, u in zip(self.powers, self.coefficients[1:],
                                            self.u_coefficients[1:], strict=True)],
-            "cells": [known.get(cell, self._unknown(cell)) for cell in self.image.cells],
+            "cells": [known.get(cell, {
+                "x": cell[0] * self.image.pitch_m, "y": cell[1] * self.image.pitch_m,
+                "dx": None, "dy": None, "u_dx": None, "u_dy": None}) for cell in self.image.cells],
             "noise_image": self.noise_image, "noise_mark": self.noise_mark}
-
-    def _unknown(self, cell: tuple[int, int]) -> dict[str, Any]:
-        """Return the JSON form of a cell whose error is not known, at its nominal place."""
-        place = complex(*cell) * self.image.pitch_m
-        return {"x": place.real, "y": place.imag, **dict.fromkeys(("dx", "dy", "u_dx", "u_dy"))}
 
 
 def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
@@ -342,35 +332,13 @@ def _read_and_shown(measurements: Measurements
             for name, cell, (m, n), one in parts}
 
 
-@dataclass(frozen=True, eq=False)
-class YawMap:
-    """Rotation of the stage from place to place, relative to its mean over the nodes.
-
-    Attributes
-    ----------
-    place : complex array (nodes,)
-        Position of the stage, m.
-    yaw, u : float array (nodes,)
-        Rotation, counter-clockwise, of what the stage carries, and its standard uncertainty, rad.
-    p : float
-        Probability that a stage that does not turn shows as much.
-    """
-
-    place: np.ndarray
-    yaw: np.ndarray
-    u: np.ndarray
-    p: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form, ``yaw`` of ``camera`` in RESULT.json."""
-        return {"x": self.place.real.tolist(), "y": self.place.imag.tolist(),
-                "yaw": self.yaw.tolist(), "u_yaw": self.u.tolist(), "p": self.p}
-
-
-def yaw_of(model: ModelFit, sense: Sense) -> YawMap | None:
+def yaw_of(model: ModelFit, sense: Sense) -> dict[str, Any] | None:
     """Return the stage's yaw that a fit shows, whatever size it was given (method eq. 4.17).
 
-    None without images, or if they do not determine it up to its mean.
+    None without images, or if they do not determine it up to its mean. Otherwise ``yaw`` of
+    ``camera`` in RESULT.json: positions of the stage, x and y, m; rotation of what it carries,
+    counter-clockwise, relative to its mean over the nodes, and its standard uncertainty, rad; p,
+    the probability that a stage that does not turn shows as much.
     """
     images, nodes = model.problem.images, model.problem.ground.yaw
     if images is None or images.yaw is None or nodes is None or model.equations is None:
@@ -390,11 +358,17 @@ def yaw_of(model: ModelFit, sense: Sense) -> YawMap | None:
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
     to_map = centred @ inverse[rows]
     share = images.noises(model.found.residuals).share
-    covariance = to_map[:, rows] @ centred + share * images.added_covariance(
-        sensitivities_of_terms(free, to_map))
+    grid, fit = free.system.grid, free.projected
+    sensitivities = grid.plate(
+        np.tensordot(to_map, free.columns.grid, axes=1),
+        (to_map @ fit.fields.T).reshape(-1, *grid.views.shape),
+        to_map @ fit.parameters[:3 * grid.n_views].T)[1]
+    covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
     covariance *= noise.sigma**2
     yaw, n = centred @ values[rows], len(centred) - 1
     statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw
     sign = -1 if sense is Sense.PLATE_MOVES else 1  # (1.6) and its rotations
-    return YawMap(sign * nodes.nodes[seen], sign * yaw, np.sqrt(np.diag(covariance)),
-                  float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))
+    place = sign * nodes.nodes[seen]
+    return {"x": place.real.tolist(), "y": place.imag.tolist(), "yaw": (sign * yaw).tolist(),
+            "u_yaw": np.sqrt(np.diag(covariance)).tolist(),
+            "p": float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n))}

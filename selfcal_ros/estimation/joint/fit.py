@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.scale import scale_of, scale_of_plate
+from selfcal_ros.estimation.datum.covariance import scale_of, scale_of_plate
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
     AngularPart,
@@ -87,7 +87,12 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
     theta = theta or angular_part(problem)
-    raw = _solve_direct(problem, y, theta) if problem.direct else _iterated(problem, y, theta)
+    if problem.direct:
+        raw = _solve_direct(problem, y, theta)
+    else:
+        from selfcal_ros.estimation.joint.pcg import solve_iterated  # scipy.fft, for large fields
+
+        raw = solve_iterated(problem, y, theta)
     field, parameters = raw.field, raw.parameters
 
     parts = system.gauge.parts(field)
@@ -121,12 +126,6 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
                     misclosure, xy, theta.noise, raw.inverse, raw.solver, raw.ratio)
-
-
-def _iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
-    from selfcal_ros.estimation.joint.pcg import solve_iterated  # scipy.fft, for large fields
-
-    return solve_iterated(problem, y, theta)
 
 
 def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:

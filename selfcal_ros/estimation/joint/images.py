@@ -18,7 +18,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.terms.equations import UNTOLD
-from selfcal_ros.estimation.terms.yaw import StageYaw
+from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations
@@ -219,15 +219,6 @@ def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
     if not any(view.cell is not None for view in views):
         return None
     return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
-
-
-def kept_images(artifact: Artifact, views: Sequence[View], noises: TwoNoises) -> dict[str, Any]:
-    """Return what a result keeps of the noise of images in its grid views, see `KEY`."""
-    seen = cells_seen(artifact, views) or ()
-    names = list(dict.fromkeys(name for name, _ in seen))
-    return {KEY: {"share": noises.share, "dof_mark": noises.dof_mark,
-                  "placing": [names.index(name) for name, _ in seen],
-                  "step": [list(step) for _, step in seen]}}
 
 
 def share_of(result: CalibrationResult) -> float:

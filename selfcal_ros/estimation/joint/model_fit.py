@@ -20,7 +20,6 @@ from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
 from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
-    Sums,
     TermEquations,
     next_coefficients,
     residual_sums,
@@ -31,7 +30,6 @@ from selfcal_ros.estimation.terms.projection import (
     project,
     reduce_anew,
     reduce_columns,
-    reduce_lines,
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
@@ -84,8 +82,6 @@ class ModelFit:
         Equations of the terms; None without terms.
     coefficients : float array (p,)
         Of the terms' columns.
-    sums : Sums
-        What is left of the readings, and its degrees of freedom.
     y : complex array (views, nx, ny)
         Deviations as the last linear step took them.
     reduced : ReducedColumns or None
@@ -99,7 +95,6 @@ class ModelFit:
     found: JointFit
     equations: TermEquations | None
     coefficients: np.ndarray
-    sums: Sums
     y: np.ndarray
     reduced: ReducedColumns | None = None
     sizes: tuple[SizeTest, ...] = ()
@@ -178,9 +173,10 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
         reduced = reduce_columns(problem.system.grid, columns.shapes)
     inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
     known = list(filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals)))
-    lines = reduce_lines(problem.system.angular, columns.lines, found.ratio, problem.half_width_m)
-    return TermEquations(problem.system, columns, project(problem.system, reduced, inverse, lines),
-                         min(known, default=0.0), found.ratio * problem.half_width_m**2)
+    projected = project(problem.system, reduced, inverse, columns.lines, ratio=found.ratio,
+                        half_width_m=problem.half_width_m)
+    return TermEquations(problem.system, columns, projected, min(known, default=0.0),
+                         found.ratio * problem.half_width_m**2)
 
 
 class _State:
@@ -203,7 +199,6 @@ class _State:
             self._linearise(columns, reduce_columns(problem.system.grid, columns.shapes))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
-        self.sums = self._sums()
 
     def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
         """Set up the equations of the terms about the present solution."""
@@ -279,16 +274,18 @@ class _State:
         equations, reduced = self.equations, self.reduced
         if equations is not None and reduced is not None and self._stale(equations):
             self._linearise(equations.columns, reduced)
-        self.sums = self._sums()
         problem = replace(self.problem, ground=self.moving.ground(self.found))
-        return ModelFit(problem, self.found, self.equations, self.coefficients, self.sums, self.y,
+        return ModelFit(problem, self.found, self.equations, self.coefficients, self.y,
                         self.reduced)
 
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
         sums = residual_sums(equations, now)
-        self.problem = with_noise(self.problem, sums)
+        self.problem = replace(
+            self.problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
+            repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
+            else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
         self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
         lines = equations.columns.lines
@@ -324,13 +321,6 @@ class _State:
             self.found.plate + self._of_terms(OF_PLATE)) + frame * (
                 grid.views.gather(self.found.field) + self._of_terms((TermName.APPROACH,)))
 
-    def _sums(self) -> Sums:
-        if self.equations is not None:
-            now = score(self.equations, self.found.both_residuals,
-                        squares(self.problem, self.found), coefficients=self.coefficients)
-            return residual_sums(self.equations, now)
-        return Sums(*squares(self.problem, self.found), float("nan"), 0)
-
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
@@ -348,11 +338,3 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
     return total, dof
-
-
-def with_noise(problem: Problem, sums: Sums) -> Problem:
-    """Return the problem with the noises of residuals and visits after the terms."""
-    within = sums.dof_within >= 1
-    repeats = sigma_of(sums.within, sums.dof_within) if within else problem.repeats_xy
-    return replace(problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
-                   repeats_xy=repeats)

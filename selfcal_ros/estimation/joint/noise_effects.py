@@ -16,7 +16,6 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
-from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 ADDED = "first_order_added"
@@ -61,8 +60,11 @@ def structured(model: ModelFit, cover: MapsCovariance,
     Those of the nodes, or of functionals `rows` of the map, as `added_variances`.
     """
     added: np.ndarray | float = 0.0
-    if contrast := axis_contrast(model):
-        added = contrast * axis_variances(model, cover, rows)
+    if contrast := axis_contrast(model):  # of noise along x in place of y, of unit size
+        turn = model.problem.to_stage[:, None, None] ** 2
+        weight = model.problem.system.grid.weight
+        added = contrast * added_variances(cover, lambda rest: np.einsum(
+            "vij,kvij->k", weight, (turn * rest**2).real), rows)
     if len(correlation := time_correlation(model)):
         added = added + correlated_variances(model, cover, correlation, rows)
     return added + image_variances(model, cover, rows)
@@ -87,18 +89,6 @@ def image_variances(model: ModelFit, cover: MapsCovariance, rows: np.ndarray | N
         own = added_variances(cover, images.own, rows, plate=plate)
         added = added * np.minimum(1.0, whole / np.where(own > 0, own, 1.0))
     return share * added
-
-
-def axis_variances(model: ModelFit, cover: MapsCovariance,
-                   rows: np.ndarray | None = None) -> np.ndarray:
-    """Return what noise along x in place of y adds to the variances, for unit noise.
-
-    The variance of a node is then that of equal noises plus `axis_contrast` times this.
-    """
-    turn = model.problem.to_stage[:, None, None] ** 2
-    weight = model.problem.system.grid.weight
-    return added_variances(cover, lambda rest: np.einsum(
-        "vij,kvij->k", weight, (turn * rest**2).real), rows)
 
 
 def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray],
@@ -128,23 +118,6 @@ def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray
         out.append([of(cover.sensitivities(*((nothing, unit * part) if plate else
                                              (unit * part, nothing)))) for part in (1, 1j)])
     return np.concatenate(out, axis=1).reshape(2, *shape)
-
-
-def sensitivities_of_terms(equations: TermEquations, to_terms: np.ndarray) -> np.ndarray:
-    """Return sensitivities as `added_variances` takes them, of combinations of the terms' sums.
-
-    Parameters
-    ----------
-    equations : TermEquations
-        Equations of the terms, p columns.
-    to_terms : float array (k, p)
-        The combinations: rows of the covariance of the coefficients for unit noise, or sums of
-        them.
-    """
-    grid, fit = equations.system.grid, equations.projected
-    fields = (to_terms @ fit.fields.T).reshape(-1, *grid.views.shape)
-    return grid.plate(np.tensordot(to_terms, equations.columns.grid, axes=1), fields,
-                      to_terms @ fit.parameters[:3 * grid.n_views].T)[1]
 
 
 TESTED = 5

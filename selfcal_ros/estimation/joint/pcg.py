@@ -9,7 +9,7 @@ Both are diagonal under the DCT-II, in whose basis a quarter turn is a transposi
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.fft import dct, dctn, idctn, next_fast_len
@@ -32,28 +32,6 @@ DENSE_DCT = 600
 """Largest side for a cosine transform by matrix product."""
 
 MAX_ITERATIONS = 2000
-
-
-@dataclass(frozen=True, eq=False)
-class Iterated:
-    """A solution by iteration.
-
-    Attributes
-    ----------
-    field : complex array (nx, ny)
-        G, in no particular datum.
-    parameters : float array (3 views,) or more
-        Misalignments.
-    iterations : int
-        Steps taken.
-    relative_residual : float
-        True residual b - N G, recomputed at the end, over |b|.
-    """
-
-    field: np.ndarray
-    parameters: np.ndarray
-    iterations: int
-    relative_residual: float
 
 
 class GridIteration:
@@ -144,7 +122,7 @@ class GridIteration:
         return out
 
     def solve(self, b: np.ndarray, d: np.ndarray, *, start: np.ndarray | None = None,
-              tolerance: float = TOLERANCE) -> Iterated:
+              tolerance: float = TOLERANCE, before: int = 0) -> FreeNetworkSolution:
         """Return the solution of the normal equations.
 
         Parameters
@@ -157,6 +135,8 @@ class GridIteration:
             Field to start from.
         tolerance : float
             Relative residual to reach.
+        before : int
+            Number of iterations to `start`.
 
         Raises
         ------
@@ -188,8 +168,10 @@ class GridIteration:
             self.remove_rigid(residual)
             count += 1
         true = _norm(right - self.product(field)) / max(_norm(right), 1e-300)
-        parameters = self.inverse @ (d - self.grid.coupled(field.ravel()))
-        return Iterated(field, parameters, count, true)
+        return FreeNetworkSolution(
+            field, self.inverse @ (d - self.grid.coupled(field.ravel())), None, np.zeros((0, 0)),
+            {"method": "conjugate gradients", "iterations": before + count,
+             "relative_residual": true})
 
 
 def preconditioner_symbols(grid: GridSystem) -> tuple[np.ndarray, np.ndarray]:
@@ -227,7 +209,8 @@ def missing_mark_correction(grid: GridSystem) -> np.ndarray:
     correction keeps the number of steps from growing with the number of missing marks.
     """
     views = grid.views
-    full = GridSystem(views.poses, views.in_field * grid.mean_weight, views.unit)
+    mean = float(grid.weight.sum() / max(grid.n_readings, 1))
+    full = GridSystem(views.poses, views.in_field * mean, views.unit)
     now, then = (views.scatter_weight(one.weight * (1 - one.relative_weight))
                  for one in (grid, full))
     good = (now > 0) & (then > 0)
@@ -266,7 +249,7 @@ def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeN
     kernel = GridIteration(grid, plain)
     if not system.angular.n_views:
         found = kernel.solve(b, d)
-        return _raw(found, near + found.parameters)
+        return replace(found, parameters=near + found.parameters)
 
     rough = kernel.solve(b, d, tolerance=ROUGH)
     _, residual = grid.plate(y, rough.field, near + rough.parameters)
@@ -277,19 +260,12 @@ def solve_iterated(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeN
     kernel.inverse = _block_inverse(problem, ratio * normal)
     d = d.copy()
     d[::3] += ratio * (length * right - normal @ phi_near)
-    found = kernel.solve(b, d, start=rough.field, tolerance=TOLERANCE)
+    found = kernel.solve(b, d, start=rough.field, before=rough.solver["iterations"])
     parameters = np.zeros(system.size)
     parameters[:n] = near + found.parameters
     at, matrix, offset = rest
     parameters[at] = length * offset - matrix @ parameters[:n:3]
-    return _raw(found, parameters, rough.iterations)
-
-
-def _raw(found: Iterated, parameters: np.ndarray, before: int = 0) -> FreeNetworkSolution:
-    return FreeNetworkSolution(
-        found.field, parameters, None, np.zeros((0, 0)),
-        {"method": "conjugate gradients", "iterations": before + found.iterations,
-         "relative_residual": found.relative_residual})
+    return replace(found, parameters=parameters)
 
 
 def _block_inverse(problem: Problem, of_phi: np.ndarray) -> np.ndarray:

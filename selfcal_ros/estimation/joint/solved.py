@@ -113,9 +113,13 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
 
 
 def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
-    """Return the mean residual in each interval of the view's time."""
+    """Return the mean residual in each of `MAX_PARTS` intervals of the view's time.
+
+    Or of each visit, if there are fewer.
+    """
     order = np.argsort(visits.stamp_ns, kind="stable")
-    starts = _starts(len(order))
+    parts = np.array_split(np.arange(len(order)), min(len(order), MAX_PARTS))
+    starts = np.array([part[0] for part in parts])
     counts = visits.count[order]
     count = np.add.reduceat(counts, starts)
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
@@ -124,14 +128,6 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
     return {"time_s": np.round(columns["time_s"], DECIMALS_S),
             "dx": np.round(columns["dx"], DECIMALS_M), "dy": np.round(columns["dy"], DECIMALS_M),
             "count": count}
-
-
-def _starts(visits: int) -> np.ndarray:
-    """Return the starts of `MAX_PARTS` intervals, or one per visit if fewer; none is empty."""
-    parts = min(visits, MAX_PARTS)
-    size, longer = divmod(visits, parts)
-    number = np.arange(parts)
-    return number * size + np.minimum(number, longer)
 
 
 KEY = "covariance_terms"

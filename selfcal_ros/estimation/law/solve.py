@@ -78,8 +78,11 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         ErrorMap(artifact, g[0], g[1], u_g[0], u_g[1], g_theta, u_theta, float(found.o[0]),
                  float(found.r[0]), law.datum),
         ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
-        tuple(_view_result(view, order.index(i), found)
-              for i, view in enumerate(measurements.views)),
+        tuple(ViewResult(
+            view.view.name, view.view.rotation_rad, *view.view.translation_m,
+            phi=float(found.phi[order.index(i), 0]), tx=float(found.t[order.index(i), 0, 0]),
+            ty=float(found.t[order.index(i), 1, 0]), used=view.used,
+            rejected=sum(view.rejected.values())) for i, view in enumerate(measurements.views)),
         # complete views: each site and each line has two readings or more
         Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
         noise,
@@ -308,13 +311,6 @@ def _to_stage(sense: str, field: np.ndarray, theta: np.ndarray,
     if sense != Sense.PLATE_MOVES:
         return field, theta
     return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
-
-
-def _view_result(view: ViewReadings, index: int, found: HuSolution) -> ViewResult:
-    tx, ty = (float(t) for t in found.t[index, :, 0])
-    return ViewResult(view.view.name, view.view.rotation_rad, *view.view.translation_m,
-                      phi=float(found.phi[index, 0]), tx=tx, ty=ty,
-                      used=view.used, rejected=sum(view.rejected.values()))
 
 
 def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:

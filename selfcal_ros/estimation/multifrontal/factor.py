@@ -252,9 +252,7 @@ _limits: list[Any] = []
 _depth = 0
 
 
-@cache
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
+_controller = cache(ThreadpoolController)
 
 
 @contextmanager

@@ -121,16 +121,13 @@ class AngularSystem:
                 rows.append(self.site[i])
                 cols.append(self.site[j])
                 values.append(value)
-        pins = self._pins()
+        parts = self.components
+        pins = np.concatenate([np.flatnonzero(parts.of_site < 0), parts.first_sites])
         rows.append(pins)
         cols.append(pins)
         values.append(np.full(len(pins), self.weight.sum() / max(self.n_readings, 1)))
         data, at = np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))
         return coo_matrix((data, at), shape=(self.n_lines, self.n_lines)).tocsc()
-
-    def _pins(self) -> np.ndarray:
-        parts = self.components
-        return np.concatenate([np.flatnonzero(parts.of_site < 0), parts.first_sites])
 
     @cached_property
     def _factor(self) -> Any:

@@ -89,13 +89,8 @@ class NormalEquations:
         out = np.zeros((self.size, self.size))
         n = 3 * self.grid.n_views
         out[:n, :n] = of_grid
-        out[self._phi_blocks] += ratio * self.angular.schur
+        out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
         return self.grid.tied(out)
-
-    @cached_property
-    def _phi_blocks(self) -> tuple[np.ndarray, ...]:
-        """Rows and columns of the rotations of the angular views."""
-        return np.ix_(self.phi_at, self.phi_at)
 
     @cached_property
     def grid_scale(self) -> float:
@@ -116,7 +111,8 @@ class NormalEquations:
 
     @cached_property
     def _core_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        return _spectrum(self._core.schur)
+        values, vectors = np.linalg.eigh(self._core.schur)
+        return values, vectors
 
     @cached_property
     def rank_schur(self) -> int:
@@ -127,7 +123,7 @@ class NormalEquations:
     def grid_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
         values, vectors = (self._core_spectrum if self._core is self.grid
-                           else _spectrum(self.grid.schur))
+                           else np.linalg.eigh(self.grid.schur))
         return pseudo_inverse(values, vectors, self.grid_scale)
 
     def alone(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +135,7 @@ class NormalEquations:
     @cached_property
     def angular_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the angular misalignment matrix."""
-        values, vectors = _spectrum(self.angular.schur)
+        values, vectors = np.linalg.eigh(self.angular.schur)
         return pseudo_inverse(values, vectors, self.angular_scale)
 
     def inverse(self, ratio: float) -> np.ndarray:
@@ -164,12 +160,8 @@ class NormalEquations:
     @cached_property
     def rank_angular(self) -> int:
         """Rank of the angular readings (method eq. 6.2)."""
-        return self.angular.rank + self.rank_turns
-
-    @cached_property
-    def rank_turns(self) -> int:
-        """Rank of the angular misalignment matrix: rotations determined by the lines alone."""
-        return _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
+        turns = _rank(np.linalg.eigvalsh(self.angular.schur), self.angular_scale)
+        return self.angular.rank + turns
 
     @cached_property
     def _null(self) -> np.ndarray:
@@ -308,11 +300,6 @@ def core_of(grid: GridSystem) -> GridSystem:
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
     return GridSystem(grid.views.poses, weight * inside, grid.views.unit, grid.rotations)
-
-
-def _spectrum(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    values, vectors = np.linalg.eigh(matrix)
-    return values, vectors
 
 
 def _trace(grid: GridSystem) -> float:

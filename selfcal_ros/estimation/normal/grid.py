@@ -115,11 +115,6 @@ class GridSystem:
             mean += relative_weight * mark
         return marks - mean
 
-    @property
-    def mean_weight(self) -> float:
-        """Mean weight of a reading."""
-        return float(self.weight.sum() / max(self.n_readings, 1))
-
     @cached_property
     def pins(self) -> np.ndarray:
         """The pinned sites: those never visited, and one of each free component."""

@@ -35,6 +35,9 @@ LOOSE = 10.0
 MAX_MODES = 21 * 21
 """Largest map whose undetermined fields are sought."""
 
+BLOCK = 1024
+"""Number of marks computed at once."""
+
 MAX_NODES = 57 * 57
 """Largest map whose matrix is factorised: 2 GB and half a minute."""
 
@@ -146,6 +149,26 @@ class PlacedSystem(GridSystem):
     def factor(self) -> DenseFactor:  # type: ignore[override]
         """Factorisation of the matrix over the nodes."""
         return DenseFactor(self.matrix)
+
+    def variance_of_means(self) -> np.ndarray:
+        """Return the variance of the mean of the stage errors at the sites of each mark, (marks,).
+
+        For known misalignments and unit noise.
+        """
+        views = self.views
+        rows = csr_matrix((self.n_marks, self.n_sites), dtype=complex)
+        for one, phase, part in zip(views.rows, views.phases, self.relative_weight, strict=True):
+            rows = rows + diags(part.ravel() * phase.conjugate()) @ one
+        inverse = self.factor.inverse.reshape(self.n_sites, *views.shape)
+        half = views.spline.coefficients(inverse).reshape(self.n_sites, -1)
+        cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
+            self.n_sites, -1)
+        out = np.zeros(self.n_marks)
+        for start in range(0, self.n_marks, BLOCK):
+            here = rows[start:start + BLOCK]
+            out[start:start + BLOCK] = np.real(
+                here.conj().multiply(here @ cover).sum(axis=1)).ravel()
+        return out
 
 
 class PlacedEquations(NormalEquations):

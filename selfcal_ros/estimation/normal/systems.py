@@ -78,7 +78,8 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     system = _equations(grid, angular)
     with _lock:
         _cache[key] = system
-        while len(_cache) > 1 and (len(_cache) > CACHED or _cached_readings() > CACHED_READINGS):
+        while len(_cache) > 1 and (len(_cache) > CACHED or sum(
+                known.grid.weight.size for known in _cache.values()) > CACHED_READINGS):
             _cache.popitem(last=False)
     return system
 
@@ -102,10 +103,6 @@ def lines_of(angular: Marks[float]) -> AngularSystem:
     if angular.harmonics and angular.poses:
         return HarmonicSystem(angular.poses, angular.weight, angular.harmonics)
     return AngularSystem(angular.poses, angular.weight)
-
-
-def _cached_readings() -> int:
-    return sum(system.grid.weight.size for system in _cache.values())
 
 
 def clear_cache() -> None:

@@ -11,15 +11,7 @@ from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction, predict
 from selfcal_ros.estimation.observability.rank import full_observability, identifies, with_unchecked
-from selfcal_ros.estimation.observability.unseen import (
-    UnseenMode,
-    angular_families,
-    component_family,
-    known_families,
-    loose_family,
-    unread_marks,
-    unvisited_family,
-)
+from selfcal_ros.estimation.observability.unseen import UnseenMode, unseen_modes
 from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import Observability
@@ -90,10 +82,10 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
     plan : Plan
         The views behind the readings.
     """
-    modes = unseen_modes(system)
+    modes = tuple(unseen_modes(system))
     cures = tuple(find_cures(plan))
     advice = tuple(("or add " if number else "add ")
-                   + " and ".join(describe_views(cure, plan.artifact))
+                   + " and ".join(describe_view(view, plan.artifact) for view in cure)
                    for number, cure in enumerate(cures[:3]))
     seen = replace(seen, modes=tuple(mode.text for mode in modes), advice=advice or seen.advice)
     return PlanCheck(seen, modes, cures)
@@ -118,16 +110,6 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
 def unit_repeats(plan: Plan) -> int:
     """Return the fewest repeats, those of the averaged reading whose noise is the unit."""
     return min(view.repeats for view in plan.views)
-
-
-def unseen_modes(system: NormalEquations) -> tuple[UnseenMode, ...]:
-    """Return the unseen families of a set of readings, the named ones first."""
-    grid = system.grid
-    families = known_families(system) if grid.n_views > 1 else []
-    families += [family for family in (
-        loose_family(system), component_family(system), unvisited_family(grid),
-        unread_marks(grid)) if family is not None]
-    return (*families, *angular_families(system))
 
 
 def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
@@ -229,11 +211,6 @@ def describe_view(view: View, artifact: Artifact) -> str:
                if step]
     also = " shifted by " if what.startswith("an unturned") else " and shifted by "
     return what + (also + " and ".join(shifted) if shifted else "")
-
-
-def describe_views(views: Iterable[View], artifact: Artifact) -> list[str]:
-    """Return several views in words."""
-    return [describe_view(view, artifact) for view in views]
 
 
 @dataclass(frozen=True)

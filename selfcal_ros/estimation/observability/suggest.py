@@ -109,27 +109,6 @@ class Against:
         """All terms."""
         return (*self.terms, *self.by_default)
 
-    @property
-    def of_microscope(self) -> bool:
-        """Whether check stops may help."""
-        return TermName.MICROSCOPE in [term.name for term in self.every]
-
-    @property
-    def of_views(self) -> "Against":
-        """Without the default terms that no choice of views determines."""
-        return replace(self, by_default=tuple(
-            term for term in self.by_default if term.name not in VISIT_TERMS))
-
-    @property
-    def of_visits(self) -> bool:
-        """Whether instant, approach and offset of a reading matter."""
-        return any(term.name in VISIT_TERMS for term in self.terms)
-
-    @property
-    def of_order(self) -> bool:
-        """Whether the visiting order matters."""
-        return any(term.name in (TermName.DRIFT, TermName.APPROACH) for term in self.terms)
-
 
 @dataclass(frozen=True)
 class Search:
@@ -223,9 +202,10 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     if plan.artifact.map_grid:
         views += _anywhere(plan, views, lambda added: score(added).key(criterion))
     steps = [*views, *more_repeats(plan)]
-    if against is not None and against.of_order:
+    terms, every = (against.terms, against.every) if against else ((), ())
+    if any(term.name in (TermName.DRIFT, TermName.APPROACH) for term in terms):
         steps += other_orders(plan)
-    if against is not None and against.of_microscope:
+    if TermName.MICROSCOPE in [term.name for term in every]:
         steps += check_stops(plan)
     out = []
     for number, step in enumerate(steps):
@@ -262,8 +242,8 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     pool = [view for view in candidates if view.grid]
     whole = Plan("best", artifact, ())
     small = smaller(whole, SEARCH_SIZE) if max(artifact.shape) > SEARCH_SIZE else whole
-    searched = _Searched(small, pool, criterion, against, progress)
-    tried, how = _search(searched, n_views - 1 - fixed)
+    tried, how = _search(small, pool, n_views - 1 - fixed, criterion=criterion, against=against,
+                         progress=progress)
     if small is not whole:
         how = replace(how, size=SEARCH_SIZE)
     judged = whole if max(artifact.shape) <= FULL_SIZE else small
@@ -326,42 +306,33 @@ def _moved_off_the_lattice(views: tuple[View, ...], artifact: Artifact,
     return _named(now)
 
 
-class _Searched:
-    """Keys of plans by their grid marks alone; one for mirror-image plans."""
+def _search(field: Plan, pool: list[View], free: int, *, criterion: str, against: Against | None,
+            progress: Progress) -> tuple[dict[tuple[int, ...], tuple], Search]:
+    """Return plans of the pool's first view and `free` others with their keys, and how found.
 
-    def __init__(self, field: Plan, pool: list[View], criterion: str,
-                 against: Against | None, progress: Progress) -> None:
-        self.field, self.criterion = field, criterion
-        self.against, self.progress = against, progress
-        self.pool = [replace(view, angular=False) for view in pool]
-        self._known: dict[tuple, tuple[float, ...]] = {}
+    By their grid marks alone; one of mirror-image plans, unless terms of the visits differ in them.
+    """
+    pool = [replace(view, angular=False) for view in pool]
+    known: dict[tuple, tuple[float, ...]] = {}
+    one_by_one = against is not None and any(term.name in VISIT_TERMS for term in against.terms)
+    if against is not None:  # no choice of views determines the default terms of the visits
+        against = replace(against, by_default=tuple(
+            term for term in against.by_default if term.name not in VISIT_TERMS))
 
-    @property
-    def one_by_one(self) -> bool:
-        """Whether mirror-image plans differ, as terms of the visits make them."""
-        return self.against is not None and self.against.of_visits
+    def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
+        views = (pool[0], *(pool[i] for i in chosen))
+        same = tuple(sorted(chosen)) if one_by_one else equivalent_key(field.artifact, views)
+        if same not in known:
+            plan = replace(field, views=_named(views))
+            known[same] = score_plan(plan, against=against).key(criterion)
+            progress(len(known), None)
+        return known[same]
 
-    def key(self, chosen: tuple[int, ...]) -> tuple[float, ...]:
-        """Return the sort key of the plan of the pool's first view with the chosen ones."""
-        views = (self.pool[0], *(self.pool[i] for i in chosen))
-        same = (tuple(sorted(chosen)) if self.one_by_one
-                else equivalent_key(self.field.artifact, views))
-        if same not in self._known:
-            plan = replace(self.field, views=_named(views))
-            against = self.against and self.against.of_views
-            self._known[same] = score_plan(plan, against=against).key(self.criterion)
-            self.progress(len(self._known), None)
-        return self._known[same]
-
-
-def _search(searched: _Searched, free: int) -> tuple[dict[tuple[int, ...], tuple], Search]:
-    """Return the plans tried with their keys, and how they were found."""
-    n_pool = len(searched.pool)
-    n_plans = comb(n_pool + free - 1, free)
-    if n_plans <= (FEW if searched.one_by_one else EXHAUSTIVE):
-        every = combinations_with_replacement(range(n_pool), free)
-        return {chosen: searched.key(chosen) for chosen in every}, Search(n_plans)
-    return _exchange(searched.key, n_pool, free), Search(None)
+    n_plans = comb(len(pool) + free - 1, free)
+    if n_plans <= (FEW if one_by_one else EXHAUSTIVE):
+        every = combinations_with_replacement(range(len(pool)), free)
+        return {chosen: key(chosen) for chosen in every}, Search(n_plans)
+    return _exchange(key, len(pool), free), Search(None)
 
 
 def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, free: int,

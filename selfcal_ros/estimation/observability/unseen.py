@@ -7,7 +7,7 @@ fields.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.angular import HarmonicSystem
+from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations, pseudo_inverse
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
@@ -72,50 +72,57 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     return bool(total - explained <= MATCH * scale)
 
 
-def known_families(system: NormalEquations) -> list[UnseenMode]:
-    """Return the unseen fields among the named ones."""
+def unseen_modes(system: NormalEquations) -> Iterator[UnseenMode]:
+    """Yield the unseen families of a set of readings, the named ones first."""
+    grid, modes = system.grid, system.loose_modes
+    if grid.n_views > 1:
+        yield from _known_families(system)
+    if len(modes):
+        yield UnseenMode("undetermined fields", f"{len(modes)} fields whose standard uncertainty "
+                         "exceeds ten times the noise of a reading", as_map(modes[0]))
+    yield from _component_family(grid)
+    missing = (grid.components.of_site < 0).reshape(grid.views.shape)
+    if missing.any():
+        at = np.argwhere(missing)[0] - np.array(grid.views.shape) // 2
+        yield UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark reaches, "
+                         f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
+    if n := int((grid.components.of_mark < 0).sum()):
+        yield UnseenMode("marks never read", f"{n} marks of the plate that no view reads",
+                         np.zeros((0,)))
+    if system.angular.n_views:
+        yield from _angular_families(system.angular)
+
+
+def _known_families(system: NormalEquations) -> Iterator[UnseenMode]:
+    """Yield the unseen fields among the named ones."""
     z = system.grid.views.z_sites
     x, y = z.real, z.imag
-    named = [
-        ("non-orthogonality", "non-orthogonality of the axes: Gx = O y, Gy = O x", y + 1j * x),
-        ("scale difference", "scale difference of the axes: Gx = R x, Gy = -R y", x - 1j * y),
-        ("bending along x", "steady turn from column to column: Gx = x y, Gy = -x^2/2",
-         x * y - 0.5j * x**2),
-        ("bending along y", "steady turn from row to row: Gx = y^2/2, Gy = -x y",
-         0.5 * y**2 - 1j * x * y),
-    ]
-    return [UnseenMode(name, text, as_map(field)) for name, text, field in named
-            if is_unseen(system, field)]
+    for name, text, field in (
+            ("non-orthogonality", "non-orthogonality of the axes: Gx = O y, Gy = O x", y + 1j * x),
+            ("scale difference", "scale difference of the axes: Gx = R x, Gy = -R y", x - 1j * y),
+            ("bending along x", "steady turn from column to column: Gx = x y, Gy = -x^2/2",
+             x * y - 0.5j * x**2),
+            ("bending along y", "steady turn from row to row: Gx = y^2/2, Gy = -x y",
+             0.5 * y**2 - 1j * x * y)):
+        if is_unseen(system, field):
+            yield UnseenMode(name, text, as_map(field))
 
 
-def loose_family(system: NormalEquations) -> UnseenMode | None:
-    """Return the fields that views at any pose leave undetermined, None if there are none."""
-    modes = system.loose_modes
-    if not len(modes):
-        return None
-    return UnseenMode("undetermined fields", f"{len(modes)} fields whose standard uncertainty "
-                      "exceeds ten times the noise of a reading", as_map(modes[0]))
-
-
-def component_family(system: NormalEquations) -> UnseenMode | None:
-    """Return the family of vectors left free by balanced components, None if one spans all."""
-    grid = system.grid
+def _component_family(grid: GridSystem) -> Iterator[UnseenMode]:
+    """Yield the family of vectors left free by balanced components, unless one spans all."""
     parts = grid.components
     free = np.flatnonzero(parts.balanced)
-    seen = parts.of_site >= 0
     if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
-        return None
-    label = np.where(seen & np.isin(parts.of_site, free), parts.of_site, -1)
+        return
+    label = np.where((parts.of_site >= 0) & np.isin(parts.of_site, free), parts.of_site, -1)
     label, phase = label.reshape(grid.views.shape), grid.free_turns[0]
     signs = np.where(label >= 0, phase.reshape(label.shape), 0)
-    name, text = _shape_of(grid, label, signs, n=len(free))
+    name, text = _shape_of(grid, label, n=len(free))
     # the example: one component against the rest
-    example = np.where(label == free[0], PHASES[signs], 0)
-    return UnseenMode(name, text, as_map(example))
+    yield UnseenMode(name, text, as_map(np.where(label == free[0], PHASES[signs], 0)))
 
 
-def _shape_of(grid: GridSystem, label: np.ndarray, signs: np.ndarray, *,
-              n: int) -> tuple[str, str]:
+def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> tuple[str, str]:
     """Name the pattern of the free components on the field."""
     shifts = {(pose.a, pose.b) for pose in grid.views.poses}
     turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
@@ -161,53 +168,25 @@ def _smallest(grid: GridSystem, label: np.ndarray) -> str:
     return text + (", ..." if len(at) > 4 else "")
 
 
-def unvisited_family(grid: GridSystem) -> UnseenMode | None:
-    """Return the sites that no mark visits as a family, None if all are visited."""
-    missing = (grid.components.of_site < 0).reshape(grid.views.shape)
-    if not missing.any():
-        return None
-    at = np.argwhere(missing)[0] - np.array(grid.views.shape) // 2
-    return UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark reaches, "
-                      f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
-
-
-def unread_marks(grid: GridSystem) -> UnseenMode | None:
-    """Return the marks that no view reads as a family, None if all are read."""
-    n = int((grid.components.of_mark < 0).sum())
-    if not n:
-        return None
-    return UnseenMode("marks never read", f"{n} marks of the plate that no view reads",
-                      np.zeros((0,)))
-
-
-def angular_families(system: NormalEquations) -> list[UnseenMode]:
-    """Return the unseen modes of the angular map, in words."""
-    angular = system.angular
-    if not angular.n_views:
-        return []
+def _angular_families(angular: AngularSystem) -> Iterator[UnseenMode]:
+    """Yield the unseen modes of the angular map, in words."""
     if isinstance(angular, HarmonicSystem):
-        return missed_harmonics(angular)
-    parts, out = angular.components, []
+        if angular.missed:
+            *most, last = (str(number) for number in angular.missed)
+            numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
+            why = ("no view turns the lines" if angular.n_views < 2 else
+                   "every turn between views is a whole number of their periods, or nearly so")
+            yield UnseenMode("angular harmonics", f"angular map: harmonic{numbers}, as {why}",
+                             np.zeros((0,)))
+        return
+    parts = angular.components
     n = len(parts.balanced)
     if n > 1:
-        out.append(UnseenMode("angular groups", _angular_text(parts, n), np.zeros((0,))))
+        yield UnseenMode("angular groups", _angular_text(parts, n), np.zeros((0,)))
     missing = int((parts.of_site < 0).sum())
     if missing:
-        out.append(UnseenMode("lines never visited", f"{missing} angles of the stage that no line "
-                              "reaches", np.zeros((0,))))
-    return out
-
-
-def missed_harmonics(lines: HarmonicSystem) -> list[UnseenMode]:
-    """Return the harmonics of the angular map that the readings do not determine, as one family."""
-    if not lines.missed:
-        return []
-    *most, last = (str(number) for number in lines.missed)
-    numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
-    why = ("no view turns the lines" if lines.n_views < 2 else
-           "every turn between views is a whole number of their periods, or nearly so")
-    return [UnseenMode("angular harmonics", f"angular map: harmonic{numbers}, as {why}",
-                       np.zeros((0,)))]
+        yield UnseenMode("lines never visited", f"{missing} angles of the stage that no line "
+                         "reaches", np.zeros((0,)))
 
 
 def _angular_text(parts: Components, n: int) -> str:

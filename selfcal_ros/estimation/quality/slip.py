@@ -22,8 +22,6 @@ from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.normal.equations import grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.residuals import Residuals
-from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder, TermColumns
-from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.causes import cause_of
 from selfcal_ros.estimation.verdict.explanations import find_explanations
 from selfcal_ros.estimation.verdict.off_sites import SLIP, PlacedSlip
@@ -155,18 +153,13 @@ def _best(found: list[SlipPlace], measurements: Measurements, options: Options) 
     order = np.argsort(losses, kind="stable")
     slip, squares, size = fits[order[0]]
     # the loss counts residuals, which are smaller than the noise by the part that the fit follows
-    dof_part = 1 - _followed(measurements, slip, options)
+    system = prepare(split_view(measurements, slip), options)[0].system
+    dof_part = 1 - system.rank_grid / (2 * system.grid.n_readings)
     near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
     others = tuple(fits[i][0] for i in order[1:] if losses[i] < near)
     tx_m, ty_m, phi_rad = size
     return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
                 others)
-
-
-def _followed(measurements: Measurements, slip: SlipPlace, options: Options) -> float:
-    """Return the mean leverage after the split."""
-    system = prepare(split_view(measurements, slip), options)[0].system
-    return system.rank_grid / (2 * system.grid.n_readings)
 
 
 def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
@@ -244,37 +237,11 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
         As `selfcal_ros.estimation.api.calibrate`.
     """
     model = fit_joint(measurements, options)
-    problem = model.problem
-    row = problem.grid.index.index(slip.index)
-    ground = problem.ground
-    placed = PlacedSlip(slip_at_line(ground, row, slip, problem.grid.poses[row].phase.conjugate()),
-                        row, 2 * MAX_PLACES)
-    found = find_explanations(model, slips=True, readings=False, placed=placed)
+    problem, axis = model.problem, "mn".index(slip.axis)
+    row, shape = problem.grid.index.index(slip.index), problem.ground.z.shape
+    after = np.indices(shape)[axis] - shape[axis] // 2 >= slip.first
+    found = find_explanations(model, slips=True, readings=False, placed=PlacedSlip(
+        row, after & (problem.ground.weight[row] > 0), 2 * MAX_PLACES))
     if not found or found[0].name == SLIP:
         return None
-    return cause_of(found[0], ground)
-
-
-def slip_at_line(ground: TermInputs, row: int, slip: Slip, phase: complex) -> TermColumns:
-    """Return the columns of a slip before a line of marks: offset along x and y, rotation.
-
-    Parameters
-    ----------
-    ground : TermInputs
-        Inputs of the columns.
-    row : int
-        The grid view.
-    slip : Slip
-        The slip.
-    phase : complex
-        Factor from the stage frame to the plate frame in that view.
-    """
-    axis = "mn".index(slip.axis)
-    line = np.indices(ground.z.shape)[axis] - ground.z.shape[axis] // 2
-    after = (line >= slip.first) & (ground.weight[row] > 0)
-    made, nowhere = ColumnBuilder(), [None] * len(ground.names)
-    for form, parts in ((phase, (("x", 1), ("y", 1j))), (ground.z, (("phi", 1j),))):
-        shape = made.add({row: (after * form).reshape(-1)}, [*nowhere])
-        for part, unit in parts:
-            made.column(Column(SLIP, row, part, np.inf), shape, unit)
-    return made.done(ground)
+    return cause_of(found[0], problem.ground)

@@ -11,7 +11,6 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.datum.scale import first_order
 from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -26,6 +25,7 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.joint.solve import views_of
 from selfcal_ros.estimation.joint.solved import noise_of
+from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -149,18 +149,22 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         seen, dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
     found["passes"] = min(view.view.repeats for view in measurements.views)
     before, problem = plate.result.verdict, readings.problem
+    unknowns = 2 * int(seen.known.sum()) + problem.system.grid.n_misalignments
+    declared = {term.name for term in options.terms}
+    terms = tuple(TermResult(
+        str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
+        for term in problem.terms)
     of_views = np.pad(seen.parameters, (0, problem.system.size - len(seen.parameters)),
                       constant_values=np.nan)
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
-        views_of(measurements, problem, of_views), _observability(readings, seen), noise,
-        measurements.all_rejected(),
+        views_of(measurements, problem, of_views), Observability(unknowns, unknowns, 0, True),
+        noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
         sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=before.enlarged_by),
-        model=ModelResult("rigid" if options.finite_rotations else "linear",
-                          _term_results(options, readings)),
+        model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
         reference=plate.result.reference, provenance=provenance_of(measurements, options),
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
         else None)
@@ -330,20 +334,6 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
     return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
                    k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
-
-
-def _observability(readings: PlateReadings, seen: Seen) -> Observability:
-    """Return that of the marks that were read: what is known is determined."""
-    grid = readings.problem.system.grid
-    unknowns = 2 * int(seen.known.sum()) + grid.n_misalignments
-    return Observability(unknowns, unknowns, 0, True)
-
-
-def _term_results(options: Options, readings: PlateReadings) -> tuple[TermResult, ...]:
-    """Return the terms of the model; none is estimated."""
-    declared = {term.name for term in options.terms}
-    return tuple(TermResult(str(term.name), term.size, (), None, "declared" if term.name in declared
-                            else "default") for term in readings.problem.terms)
 
 
 def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],

@@ -15,7 +15,7 @@ width and s the signs of approach (reality of machines; docs/method.md, terms of
     yaw          V has -i yaw d at d in the image, 1 a node, shared
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -66,9 +66,9 @@ class TermColumns:
         Mean over the visits of every mark, plate frame; 0 where not read.
     within : WithinMarks
         What the means hide.
-    at : list
-        Values of each shape at the visits of each view, (V,), plate frame; None where they are
-        those of the means.
+    at : list of dict
+        Values of each shape at the visits of views, (V,), plate frame; those of the means in
+        other views.
     lines : LineColumns
         Those in the readings of lines, rad.
     """
@@ -85,12 +85,6 @@ class TermColumns:
         return self.shapes.grid
 
     @property
-    def seen(self) -> AtVisits:
-        """Values of each column at the visits of each view, as `at` has them of the shapes."""
-        return [[None if one is None else unit * one for one in self.at[shape]]
-                for shape, unit in zip(self.shapes.of_column, self.shapes.unit, strict=True)]
-
-    @property
     def size(self) -> np.ndarray:
         """Known standard deviation of every coefficient, (p,); infinite if free."""
         return np.array([column.size for column in self.columns])
@@ -102,10 +96,9 @@ class TermColumns:
         """
         of_shape = np.zeros(len(self.at), dtype=complex)
         np.add.at(of_shape, self.shapes.of_column, coefficients * self.shapes.unit)
-        views = len(self.at[0]) if self.at else 0
         return [sum((value * shape[view] for value, shape in zip(
-            of_shape, self.at, strict=True) if shape[view] is not None), start=0.0)
-            for view in range(views)]
+            of_shape, self.at, strict=True) if view in shape), start=0.0)
+            for view in range(len(self.shapes.rows))]
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which columns belong to the terms `names`, bool (p,)."""
@@ -123,6 +116,7 @@ class TermColumns:
 class ColumnBuilder:
     """Columns under construction: their shapes at the marks (marks,) by view, and at the visits."""
 
+    ground: TermInputs
     columns: list[Column] = field(default_factory=list)
     of_column: list[int] = field(default_factory=list)
     unit: list[complex] = field(default_factory=list)
@@ -130,10 +124,10 @@ class ColumnBuilder:
     at: AtVisits = field(default_factory=list)
     lines: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
-    def add(self, means: dict[int, np.ndarray], at: list[np.ndarray | None]) -> int:
+    def add(self, means: dict[int, np.ndarray], at: dict[int, np.ndarray] | None = None) -> int:
         """Add a shape; return its number."""
         self.means.append(means)
-        self.at.append(at)
+        self.at.append(at or {})
         return len(self.means) - 1
 
     def column(self, column: Column, shape: int, unit: complex) -> None:
@@ -142,11 +136,27 @@ class ColumnBuilder:
         self.of_column.append(shape)
         self.unit.append(unit)
 
-    def done(self, ground: TermInputs) -> TermColumns:
+    def add_terms(self, terms: Iterable[ModelTerm], degree: int) -> None:
+        """Add the columns of terms, see `term_columns`."""
+        for term in terms:
+            if term.name in VISIT_TERMS:
+                _require_visits(self.ground, term.name)
+            if term.name in OF_LINES:
+                _line_columns(self, term)
+            elif term.name is TermName.YAW:
+                _yaw_columns(self, term)
+            elif term.name not in VISIT_TERMS:
+                _plate_columns(self, term)
+            elif term.name is TermName.DRIFT:
+                _drift_columns(self, term, degree)
+            else:
+                _shared_columns(self, term)
+
+    def done(self) -> TermColumns:
         """Return the columns."""
-        shapes = shapes_of(self.means, self.of_column, self.unit, ground.weight)
+        shapes = shapes_of(self.means, self.of_column, self.unit, self.ground.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
-        within = within_marks(ground.visits, self.at, shapes)
+        within = within_marks(self.ground.visits, self.at, shapes)
         return TermColumns(tuple(self.columns), shapes, within, self.at,
                            LineColumns(np.array(at), np.stack(values)) if at else NO_LINES)
 
@@ -168,21 +178,9 @@ def term_columns(ground: TermInputs, terms: Iterable[ModelTerm], degree: int) ->
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    made = ColumnBuilder()
-    for term in terms:
-        if term.name in VISIT_TERMS:
-            _require_visits(ground, term.name)
-        if term.name in OF_LINES:
-            _line_columns(made, ground, term)
-        elif term.name is TermName.YAW:
-            _yaw_columns(made, ground, term)
-        elif term.name not in VISIT_TERMS:
-            _plate_columns(made, ground, term)
-        elif term.name is TermName.DRIFT:
-            _drift_columns(made, ground, term, degree)
-        else:
-            _shared_columns(made, ground, term)
-    return made.done(ground)
+    made = ColumnBuilder(ground)
+    made.add_terms(terms, degree)
+    return made.done()
 
 
 def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *,
@@ -200,10 +198,10 @@ def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *
     moved : bool
         Whether visits differ from the means of their marks otherwise than before.
     """
-    fresh, at = ColumnBuilder(), list(before.at)
+    fresh, at = ColumnBuilder(ground), list(before.at)
     own: dict[int, int] = {}
     if term is not None:
-        _shared_columns(fresh, ground, term)
+        _shared_columns(fresh, term)
         changed = before.shapes.of_column[before.rows([term.name])]
         # the shape of each new column takes the place of that of the same column before
         own = dict(zip(fresh.of_column, changed.tolist(), strict=True))
@@ -217,43 +215,6 @@ def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *
     return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
-def columns_from(ground: TermInputs, columns: Iterable[Column],
-                 shapes: Iterable[tuple[np.ndarray, Sequence[complex]]]) -> TermColumns:
-    """Return columns of one view each.
-
-    Parameters
-    ----------
-    ground : TermInputs
-        Plate, views, visits.
-    columns : iterable of Column
-        What each is.
-    shapes : iterable of tuple
-        Values at the visits of a view, (V,), plate frame, and the units, 1 or i, of the columns
-        that are made of them: as many columns in a row, of one view.
-    """
-    made, rest = ColumnBuilder(), iter(columns)
-    for values, units in shapes:
-        mine = [next(rest) for _ in units]
-        [view] = {column.view for column in mine}
-        visits = ground.visits[view]
-        if visits is None:
-            raise ValueError(f"column of view {view}: its visits are not known")
-        at: list[np.ndarray | None] = [None] * len(ground.names)
-        at[view] = values
-        number = made.add({view: visits.means(values[None], ground.z.size)[0]}, at)
-        for column, unit in zip(mine, units, strict=True):
-            made.column(column, number, unit)
-    return made.done(ground)
-
-
-def joined(ground: TermInputs, first: TermColumns, second: TermColumns) -> TermColumns:
-    """Return the columns of both."""
-    at = [*first.at, *second.at]
-    shapes = first.shapes.with_others(second.shapes)
-    return TermColumns((*first.columns, *second.columns), shapes,
-                       within_marks(ground.visits, at, shapes), at, first.lines)
-
-
 def _require_visits(ground: TermInputs, name: TermName) -> None:
     for view, visits in zip(ground.names, ground.visits, strict=True):
         if visits is None:
@@ -262,8 +223,8 @@ def _require_visits(ground: TermInputs, name: TermName) -> None:
                              "contain them", "solve from the bag, or leave the term out")
 
 
-def _drift_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm, degree: int) -> None:
-    orders = np.arange(1, degree + 1)
+def _drift_columns(made: ColumnBuilder, term: ModelTerm, degree: int) -> None:
+    orders, ground = np.arange(1, degree + 1), made.ground
     for first, members in ground.members.items():
         values, means = {}, {}
         for view in members:
@@ -271,26 +232,24 @@ def _drift_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm, deg
                 values[view] = eval_legendre(orders[:, None], visits.time) * visits.phase
                 means[view] = visits.means(values[view], ground.z.size)
         for row, order in enumerate(orders if values else ()):
-            at = [values[v][row] if v in values else None for v in range(len(ground.names))]
-            number = made.add({view: mean[row] for view, mean in means.items()}, at)
+            number = made.add({view: mean[row] for view, mean in means.items()},
+                              {view: value[row] for view, value in values.items()})
             for axis, unit in AXES:
                 made.column(Column(term.name, first, f"{axis} P{order}", term.size), number, unit)
 
 
-def _shared_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
+def _shared_columns(made: ColumnBuilder, term: ModelTerm) -> None:
     """Add the columns of a term of the visits whose coefficients all views share."""
-    both = [None if visits is None else _values(ground, term.name, visits) * visits.phase
-            for visits in ground.visits]
-    # in the nominal frame, as the map: an approach that every visit of a site has is the map's
-    frames = [visits.frame if visits is not None and term.name is TermName.APPROACH else 1.0
-              for visits in ground.visits]
-    means = [None if visits is None or values is None
-             else visits.means(values / frame, ground.z.size)
-             for visits, values, frame in zip(ground.visits, both, frames, strict=True)]
+    ground, both, means = made.ground, {}, {}
+    for view, visits in enumerate(ground.visits):
+        if visits is not None:
+            both[view] = _values(ground, term.name, visits) * visits.phase
+            # in the nominal frame, as the map: an approach that every visit has is the map's
+            frame = visits.frame if term.name is TermName.APPROACH else 1.0
+            means[view] = visits.means(both[view] / frame, ground.z.size)
     for row, parts in enumerate(_SHARED[term.name]):
-        number = made.add(
-            {view: mean[row] for view, mean in enumerate(means) if mean is not None},
-            [None if values is None else values[row] for values in both])
+        number = made.add({view: mean[row] for view, mean in means.items()},
+                          {view: values[row] for view, values in both.items()})
         for component, unit in parts:
             if size := term.size_of(component):
                 made.column(Column(term.name, -1, component, size), number, unit)
@@ -309,16 +268,16 @@ def _values(ground: TermInputs, name: TermName, visits: ViewVisits) -> np.ndarra
     return ground.indicated * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
 
 
-def _yaw_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
+def _yaw_columns(made: ColumnBuilder, term: ModelTerm) -> None:
     """Add the columns of the stage's yaw: the same at all visits of a mark."""
+    ground = made.ground
     if ground.yaw is None:
         return
     phases = [nominal if view is None else view.phase
               for view, nominal in zip(ground.visits, ground.yaw.phases, strict=True)]
     here = ground.weight.reshape(len(phases), -1) > 0
     for node, means in enumerate(ground.yaw.columns(phases, _beside_cells(ground))):
-        shape = made.add({view: values * here[view] for view, values in means.items()},
-                         [None] * len(phases))
+        shape = made.add({view: values * here[view] for view, values in means.items()})
         made.column(Column(term.name, -1, f"node {node}", term.size), shape, 1)
 
 
@@ -340,20 +299,17 @@ def _beside_cells(ground: TermInputs) -> np.ndarray:
     return out
 
 
-def _plate_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
+def _plate_columns(made: ColumnBuilder, term: ModelTerm) -> None:
     """Add the columns of plate scale or shape: the same at all visits of a mark.
 
     A size says how far placings scatter about what they have in common, so that each has its own;
     free ones are relative to the first placing, as what all have in common is the plate's.
     """
-    parts = _PLATE[term.name]
-    forms = _plate_forms(ground, term.name)
-    nothing: list[np.ndarray | None] = [None] * len(ground.names)
+    ground, forms = made.ground, _plate_forms(made.ground, term.name)
     for first, members in list(ground.members.items())[1 if term.free else 0:]:
         here = {view: ground.weight[view].reshape(-1) > 0 for view in members}
-        numbers = [made.add({view: form * read for view, read in here.items()}, nothing)
-                   for form in forms]
-        for component, form, unit in parts:
+        numbers = [made.add({view: form * read for view, read in here.items()}) for form in forms]
+        for component, form, unit in _PLATE[term.name]:
             made.column(Column(term.name, first, component, term.size), numbers[form], unit)
 
 
@@ -376,17 +332,16 @@ def _plate_forms(ground: TermInputs, name: TermName) -> np.ndarray:
     return forms[:1] if name is TermName.PLATE_SCALE else forms
 
 
-def _line_columns(made: ColumnBuilder, ground: TermInputs, term: ModelTerm) -> None:
+def _line_columns(made: ColumnBuilder, term: ModelTerm) -> None:
     """Add the columns of a term of the lines, which no grid reading has."""
-    count = len(ground.line_names)
+    ground, count = made.ground, len(made.ground.line_names)
     angle = 2 * np.pi / max(ground.n_lines, 1) * np.arange(ground.n_lines)
     views, waves = tuple(range(count)), {"cos": np.cos(angle), "sin": np.sin(angle)}
     if term.name is TermName.ROTATION:
         views, waves = ground.with_lines, {"turn": np.ones_like(angle)}
-    nothing: list[np.ndarray | None] = [None] * len(ground.names)
     for view in views[int(term.free):]:
         for component, wave in waves.items():
             values = np.zeros((count, ground.n_lines))
             values[view] = wave
             made.lines.append((len(made.columns), values))
-            made.column(Column(term.name, view, component, term.size), made.add({}, nothing), 1)
+            made.column(Column(term.name, view, component, term.size), made.add({}), 1)

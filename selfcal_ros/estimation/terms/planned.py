@@ -20,11 +20,9 @@ from selfcal_ros.estimation.terms.projection import (
     ProjectedColumns,
     project,
     reduce_columns,
-    reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import WithinMarks
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
-from selfcal_ros.estimation.terms.yaw import stage_yaw
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
@@ -157,9 +155,8 @@ def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterab
     if len(columns.lines.at):
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
         inverse = system.inverse(ratio)
-    lines = reduce_lines(system.angular, columns.lines, ratio, length)
-    return TermEquations(system, columns, project(system, reduced, inverse, lines),
-                         assumed.sigma_m, ratio * length**2)
+    projected = project(system, reduced, inverse, columns.lines, ratio=ratio, half_width_m=length)
+    return TermEquations(system, columns, projected, assumed.sigma_m, ratio * length**2)
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:

@@ -156,49 +156,8 @@ class ProjectedColumns:
         return self.make_fields()
 
 
-@dataclass(frozen=True, eq=False)
-class ReducedLines:
-    """Columns of lines with the lines of stage and plate eliminated, in grid units.
-
-    Attributes
-    ----------
-    at : int array (q,)
-        Indices of the columns.
-    free : float array (K, q)
-        Their effect on the stage's lines alone, rad.
-    right : float array (views, q)
-        Right-hand side of the misalignments.
-    gram : float array (q, q)
-        Weighted inner products of the residuals.
-    half_width_m : float
-        Unit of the misalignments, m.
-    """
-
-    at: np.ndarray
-    free: np.ndarray
-    right: np.ndarray
-    gram: np.ndarray
-    half_width_m: float
-
-
-def reduce_lines(angular: AngularSystem, lines: LineColumns, ratio: float,
-                 half_width_m: float) -> ReducedLines:
-    """Return columns of lines; a reading has the weight `ratio` times `half_width_m` squared."""
-    if not len(lines.at):
-        return ReducedLines(lines.at, np.zeros((angular.n_lines, 0)),
-                            np.zeros((angular.n_views, 0)), np.zeros((0, 0)), half_width_m)
-    values = np.moveaxis(lines.values, 0, -1)
-    weighted = angular.weight[:, :, None] * angular.centred(values)
-    lines_right = angular.scatter(weighted)
-    free = angular.solve(lines_right)
-    gram = np.einsum("vkp,vkq->pq", values, weighted) - lines_right.T @ free
-    right = weighted.sum(axis=1) - angular.columns.T @ free
-    return ReducedLines(lines.at, free, ratio * half_width_m * right,
-                        ratio * half_width_m**2 * (gram + gram.T) / 2, half_width_m)
-
-
 def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
-            lines: ReducedLines) -> ProjectedColumns:
+            lines: LineColumns, *, ratio: float, half_width_m: float) -> ProjectedColumns:
     """Return the effect of the columns on the joint estimate.
 
     Parameters
@@ -209,17 +168,36 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
         The columns with the sites eliminated.
     inverse : float array (size, size)
         Covariance of the misalignments for unit noise of one grid reading.
-    lines : ReducedLines
-        The columns of lines.
+    lines : LineColumns
+        The columns of lines; a reading has the weight `ratio` times `half_width_m` squared.
+    ratio, half_width_m : float
+        Weight of a line, and the unit of the misalignments, m.
     """
-    grid, n = system.grid, 3 * system.grid.n_views
+    angular, n = system.angular, 3 * system.grid.n_views
     right = np.zeros((system.size, reduced.right.shape[1]))
     right[:n] = reduced.right
-    right[np.ix_(system.phi_at, lines.at)] += lines.right
+    free, of_lines, gram_of_lines = _lines_eliminated(angular, lines)
+    right[np.ix_(system.phi_at, lines.at)] += ratio * half_width_m * of_lines
     parameters = inverse @ right
     gram = reduced.gram - right.T @ parameters
-    gram[np.ix_(lines.at, lines.at)] += lines.gram
-    turned = system.angular.response @ parameters[system.phi_at] / lines.half_width_m
-    turned[:, lines.at] -= lines.free
-    return ProjectedColumns(lambda: reduced.free - grid.response @ parameters[:n], parameters,
-                            (gram + gram.T) / 2, turned)
+    gram[np.ix_(lines.at, lines.at)] += ratio * half_width_m**2 * gram_of_lines
+    turned = angular.response @ parameters[system.phi_at] / half_width_m
+    turned[:, lines.at] -= free
+    return ProjectedColumns(lambda: reduced.free - system.grid.response @ parameters[:n],
+                            parameters, (gram + gram.T) / 2, turned)
+
+
+def _lines_eliminated(angular: AngularSystem,
+                      lines: LineColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what q columns make of the stage's lines, (K, q), and right-hand side and products.
+
+    Of the misalignments, (views, q), and of the residuals, (q, q).
+    """
+    if not len(lines.at):
+        return np.zeros((angular.n_lines, 0)), np.zeros((angular.n_views, 0)), np.zeros((0, 0))
+    values = np.moveaxis(lines.values, 0, -1)
+    weighted = angular.weight[:, :, None] * angular.centred(values)
+    lines_right = angular.scatter(weighted)
+    free = angular.solve(lines_right)
+    gram = np.einsum("vkp,vkq->pq", values, weighted) - lines_right.T @ free
+    return free, weighted.sum(axis=1) - angular.columns.T @ free, (gram + gram.T) / 2

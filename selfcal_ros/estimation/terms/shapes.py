@@ -17,7 +17,7 @@ import numpy as np
 
 from selfcal_ros.estimation.terms.visits import ViewVisits, squares_within
 
-AtVisits = list[list[np.ndarray | None]]
+AtVisits = list[dict[int, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +102,6 @@ class Shapes:
     def part(self, columns: np.ndarray) -> "Shapes":
         """Return some of the columns, bool (p,); the shapes are the same."""
         return replace(self, of_column=self.of_column[columns], unit=self.unit[columns])
-
-    def with_others(self, other: "Shapes") -> "Shapes":
-        """Return these columns and those of another."""
-        return Shapes(
-            self.n + other.n, self.lattice,
-            tuple(np.concatenate([a, b + self.n]) for a, b in zip(
-                self.rows, other.rows, strict=True)),
-            tuple(np.concatenate(pair) for pair in zip(self.values, other.values, strict=True)),
-            np.concatenate([self.of_column, other.of_column + self.n]),
-            np.concatenate([self.unit, other.unit]))
 
     def replaced(self, shapes: Sequence[int], means: Sequence[Mapping[int, np.ndarray]]
                  ) -> "Shapes":
@@ -203,7 +193,7 @@ def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shap
     ----------
     visits : sequence of ViewVisits or None
         Visits of each view.
-    at : list
+    at : list of dict
         Values of each shape at the visits, as in `TermColumns`.
     shapes : Shapes
         Those at the means, and the columns.
@@ -222,10 +212,10 @@ def within_anew(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shape
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)
     for view, seen in enumerate(visits):
-        mine = [k for k in changed if at[k][view] is not None]
+        mine = [k for k in changed if view in at[k]]
         if seen is None or not (seen.repeated and mine):
             continue
-        here = [k for k in range(shapes.n) if at[k][view] is not None]
+        here = [k for k in range(shapes.n) if view in at[k]]
         # about the means of their marks: then those of the others drop out
         moved = seen.about_means(np.array([at[k][view] for k in mine]), n_marks)
         weighted = np.conj(moved) * seen.weight

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of the term columns: visits of each grid view, their approach, poses of the plate.
+"""Inputs of the term columns: visits of each grid view, their approach, poses of the plate, yaw.
 
 For the map, the mean over the visits of a mark is as good as the visits themselves. The scatter of
 the visits of one mark about their mean determines terms that differ between them, and the noise.
+
+The yaw of the stage has a coefficient at each node of a grid over the field, with bilinear
+interpolation between them: a mark at d from the optical axis is read at d - i yaw d (eq. 4.17).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,10 +17,10 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
-from selfcal_ros.estimation.terms.yaw import StageYaw, stage_yaw
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
-from selfcal_ros.model.view import placings_of
+from selfcal_ros.model.view import View, placings_of
 
 FARTHEST_M = 1e6
 """Largest valid deviation or offset of a visit."""
@@ -100,24 +103,6 @@ def squares_within(visits: Iterable[ViewVisits | None]) -> float:
     return total
 
 
-def approach_sign(sense: Sense) -> int:
-    """Return the sign of the indicated position in a reading: -1 where the plate moves."""
-    return -1 if sense is Sense.PLATE_MOVES else 1
-
-
-def visits_of(measurements: Measurements, grid: GridData,
-              placings: Sequence[int]) -> tuple[ViewVisits | None, ...]:
-    """Return the visits of every grid view, in the order of `grid`; None if unknown.
-
-    The time is that of the placing to which a view belongs, see `TermInputs`.
-    """
-    views = [measurements.views[i] for i in grid.index]
-    ranges = time_ranges(views, placings)
-    return tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
-                            measurements.artifact.flat(view.m, view.n))
-                 for row, view in enumerate(views))
-
-
 def time_ranges(views: Iterable[ViewReadings],
                 placings: Iterable[int]) -> dict[int, tuple[int, int]]:
     """Return the first and the last instant of each placing, ns, that has visits."""
@@ -132,7 +117,10 @@ def time_ranges(views: Iterable[ViewReadings],
 
 def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None,
                flat: np.ndarray) -> ViewVisits | None:
-    """Return the visits of a view whose marks have the indices `flat` (P,)."""
+    """Return the visits of a view whose marks have the indices `flat` (P,); None if unknown.
+
+    `ends` are those of the time of the placing to which it belongs, see `TermInputs`.
+    """
     visits = view.visits
     if visits is None or not len(visits.mark) or ends is None:
         return None
@@ -149,26 +137,24 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, in
 def check_visits(measurements: Measurements) -> None:
     """Raise InputError for invalid visits: of no mark, or not finite."""
     for view in measurements.views:
-        if view.visits is not None and len(view.visits.mark):
-            _check(view.visits, view)
-
-
-def _check(visits: GridVisits, view: ViewReadings) -> None:
-    where, number = f"view '{view.view.name}' visits of grid marks", len(visits.mark)
-    columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
-               visits.offset_y, visits.approach_x, visits.approach_y)
-    if any(len(column) != number for column in columns):
-        raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches differ "
-                         "in length", "give one value per visit")
-    if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
-        raise InputError(where, "a visit belongs to none of the marks that were read",
-                         "number the marks as `m` and `n` have them")
-    if visits.count.min() < 1:
-        raise InputError(where, "a count below 1", "leave out visits without a reading")
-    for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
-        if not (np.abs(values) < FARTHEST_M).all():
-            raise InputError(where, "a deviation or offset is not a finite number, or no length "
-                             "of a stage", "remove the visit")
+        visits = view.visits
+        if visits is None or not len(visits.mark):
+            continue
+        where = f"view '{view.view.name}' visits of grid marks"
+        columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
+                   visits.offset_y, visits.approach_x, visits.approach_y)
+        if any(len(column) != len(visits.mark) for column in columns):
+            raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches "
+                             "differ in length", "give one value per visit")
+        if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
+            raise InputError(where, "a visit belongs to none of the marks that were read",
+                             "number the marks as `m` and `n` have them")
+        if visits.count.min() < 1:
+            raise InputError(where, "a count below 1", "leave out visits without a reading")
+        for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
+            if not (np.abs(values) < FARTHEST_M).all():
+                raise InputError(where, "a deviation or offset is not a finite number, or no "
+                                 "length of a stage", "remove the visit")
 
 
 def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
@@ -211,6 +197,79 @@ def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, i
     if not repeated or dof < least_dof:
         return None
     return float(np.sqrt(total / dof)), dof
+
+
+MOST_NODES = 11
+"""Largest number of nodes along each axis; up to it they are the sites."""
+
+MOST_VALUES = 16_000_000
+"""Largest number of values of all columns, 256 MB, to which fewer nodes are due."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageYaw:
+    """Nodes of the yaw, and how marks in the cells of images depend on it.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Number of nodes along x and y.
+    half_m : tuple of float
+        Half the sides of the field that they cover, m.
+    arms : complex array (views,)
+        Place of the cell of each view in the image, stage axes, m.
+    places : complex array (views, marks)
+        Where the stage stands for each mark of each view, in the sense of (1.6), m.
+    phases : complex array (views,)
+        From the stage frame to the plate frame.
+    """
+
+    shape: tuple[int, int]
+    half_m: tuple[float, float]
+    arms: np.ndarray
+    places: np.ndarray
+    phases: np.ndarray
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Places of the nodes, in the sense of (1.6), complex (nodes,), m."""
+        x, y = (np.linspace(-half, half, n) for half, n in zip(
+            self.half_m, self.shape, strict=True))
+        return (x[:, None] + 1j * y).ravel()
+
+    def columns(self, phases: Sequence[complex] | None = None,
+                beside: np.ndarray | None = None) -> Iterator[dict[int, np.ndarray]]:
+        """Yield the readings of all marks for a yaw of 1 rad at each node, by view, plate frame.
+
+        `phases` replace those of the nominal poses; `beside`, (views, marks), is where the marks
+        are beside the places of their cells, stage axes, m: a constant yaw, a turn of the camera,
+        does not act on it.
+        """
+        nx, ny = self.shape
+        x, y = (np.clip((part / half + 1) / 2, 0, 1) * (n - 1) for part, half, n in zip(
+            (self.places.real, self.places.imag), self.half_m, self.shape, strict=True))
+        unit = -1j * (self.phases if phases is None else np.array(phases))[:, None]
+        turned = unit * (self.arms[:, None] + (0 if beside is None else beside))
+        constant = unit * (0 if beside is None else beside) / (nx * ny)
+        seen = np.flatnonzero(turned.any(axis=1))
+        for i in range(nx):
+            along = np.maximum(1 - np.abs(x - i), 0)
+            for j in range(ny):
+                weight = along * np.maximum(1 - np.abs(y - j), 0)
+                yield {view: turned[view] * weight[view] - constant[view] for view in seen.tolist()}
+
+
+def stage_yaw(artifact: Artifact, views: Sequence[View]) -> StageYaw | None:
+    """Return the yaw behind the grid views of a measurement; None without images."""
+    arms = np.array([view.cell_m for view in views])
+    if not arms.any():
+        return None
+    sites = artifact.field.shape
+    most = int(np.sqrt(MOST_VALUES / (len(views) * artifact.m.size)))
+    nx, ny = (min(n, max(most, 2), MOST_NODES) for n in sites)
+    return StageYaw((nx, ny), artifact.field_half_m, arms, np.stack([
+        view.pose.places(artifact, artifact.m, artifact.n).ravel() for view in views]),
+        np.array([view.pose.phase for view in views]).conj())
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,10 +351,15 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = maps_of(grid.y.shape[1:], grid.poses).z
-    views = [measurements.views[i].view for i in grid.index]
+    readings = [measurements.views[i] for i in grid.index]
+    views = [view.view for view in readings]
     placings = placings_of(views)
-    return TermInputs(z, half_width_m, grid.weight, visits_of(measurements, grid, placings),
-                      tuple(view.name for view in views), approach_sign(measurements.sense),
+    ranges = time_ranges(readings, placings)
+    visits = tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
+                              measurements.artifact.flat(view.m, view.n))
+                   for row, view in enumerate(readings))
+    return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
+                      -1 if measurements.sense is Sense.PLATE_MOVES else 1,
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),

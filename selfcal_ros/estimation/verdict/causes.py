@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import eval_legendre, fdtrc
@@ -14,16 +14,13 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.columns import Column
-from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, FLOOR_M, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
-from selfcal_ros.estimation.verdict.uncertainty import Effect
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import UNITS, TermName
-from selfcal_ros.model.verdict import Cause, TermEstimate
+from selfcal_ros.model.verdict import Cause
 
 TIMES = np.linspace(-1, 1, 101)
 """Instants of a view at which the range of a drift is evaluated."""
@@ -73,21 +70,6 @@ def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = Tru
     columns = tuple(compress(equations.columns.columns, rows))
     found = Explanation(str(name), columns, model.coefficients[rows], covariance, p, whole, 0.0)
     return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
-
-
-def size_cause(test: SizeTest, estimates: Iterable[TermEstimate]) -> Cause:
-    """Return a size of a term that the readings contradict as a cause.
-
-    Parameters
-    ----------
-    test : SizeTest
-        The failed test.
-    estimates : iterable of TermEstimate
-        Coefficients of the term, fitted without that size.
-    """
-    largest = max(estimates, key=lambda e: abs(e.value))
-    return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
-                 largest.view, details={"given": test.given})
 
 
 def scatter_of_views(model: ModelFit, measurements: Measurements
@@ -251,16 +233,6 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     return replace(cause_of(held, model.problem.ground), p=p)
 
 
-class OffLine(NamedTuple):
-    """A faulty reading of a line: row of its view, line, error and its u, rad, and probability."""
-
-    view: int
-    k: int
-    off_rad: float
-    u_rad: float
-    p: float
-
-
 def line_cause(problem: Problem, measurements: Measurements, level: float) -> Cause | None:
     """Return the reading of a line that contradicts the others most; None if none does.
 
@@ -277,14 +249,11 @@ def line_cause(problem: Problem, measurements: Measurements, level: float) -> Ca
     level : float
         Level of the test.
     """
-    worst = min(_suspects(problem), key=lambda line: line.p, default=None)
-    if worst is None or not worst.p < level:
-        return None
-    view = measurements.views[problem.angular.index[worst.view]].view.name
-    return Cause(READING, worst.off_rad, worst.u_rad, "rad", worst.p, view, mark=(worst.k,))
+    worst = min(_suspects(problem, measurements), key=lambda line: line.p, default=None)
+    return worst if worst is not None and worst.p < level else None
 
 
-def _suspects(problem: Problem) -> Iterator[OffLine]:
+def _suspects(problem: Problem, measurements: Measurements) -> Iterator[Cause]:
     """Yield the readings of lines with the largest residuals, each tested."""
     system, angular = problem.system, problem.system.angular
     dof = angular.n_readings - system.rank_angular
@@ -305,11 +274,5 @@ def _suspects(problem: Problem) -> Iterator[OffLine]:
         if variance <= FLOOR**2:
             continue
         p = float(fdtrc(1, dof - 1, gained / variance)) * angular.n_readings
-        yield OffLine(v, k, off, float(np.sqrt(variance / (weight * left))), min(p, 1.0))
-
-
-def effect_of_line(cause: Cause, artifact: Artifact) -> Effect:
-    """Return the effect of a faulty reading of a line: its error at most."""
-    theta = np.zeros(artifact.angular_count)
-    theta[:] = abs(cause.size) / np.sqrt(max(len(theta), 1))
-    return Effect(cause.name, np.zeros((2, *artifact.field.shape)), theta)
+        yield Cause(READING, off, float(np.sqrt(variance / (weight * left))), "rad", min(p, 1.0),
+                    measurements.views[problem.angular.index[v]].view.name, mark=(k,))

@@ -19,13 +19,14 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import noise_excess
-from selfcal_ros.estimation.terms.columns import Column, TermColumns, joined, term_columns
+from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
-from selfcal_ros.estimation.terms.visits import TermInputs, without_noise
+from selfcal_ros.estimation.terms.visits import without_noise
 from selfcal_ros.estimation.verdict.off_sites import (
     READING,
     SLIP,
     PlacedSlip,
+    add_slip,
     reading_columns,
     slip_columns,
 )
@@ -269,18 +270,24 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     told = all(visits is not None for visits in ground.visits)
     more = [ModelTerm(name) for name in TermName
             if name not in own and (told or name not in VISIT_TERMS)]
-    columns = term_columns(ground, (*problem.terms, *more), problem.drift_degree)
-    groups = list(_groups(columns, [term.name for term in more]))
+    made, views = ColumnBuilder(ground), problem.system.grid.views
+    made.add_terms((*problem.terms, *more), problem.drift_degree)
+    groups = list(_groups(made.columns, [term.name for term in more]))
+    phases, every = views.phases.conj(), int(np.count_nonzero(ground.weight))
     if slips:
-        steps, places = slip_columns(ground)
-        columns, groups = _with(ground, (columns, groups), steps, [
-            Group(SLIP, rows, *at, len(places)) for at, rows in places.items()])
+        steps = list(slip_columns(made))
+        groups += [Group(SLIP, np.array(rows), view, part, len(steps))
+                   for rows, view, part in steps]
     if readings:
-        columns, groups = _with_readings(model, ground, columns, groups)
+        groups += [Group(READING, np.array(rows), view, places=every, mark=views.mark_at(*place))
+                   for rows, view, place in reading_columns(made, model.found.residuals, phases)]
     if placed is not None:
-        all_of_it = np.ones(len(placed.columns.columns), dtype=bool)
-        columns, groups = _with(ground, (columns, groups), placed.columns, [
-            Group(SLIP, all_of_it, placed.view, places=placed.places)])
+        moved, turned = placed.after * phases[placed.view], placed.after * ground.z
+        rows = add_slip(made, placed.view, (moved.reshape(-1), turned.reshape(-1)))
+        groups.append(Group(SLIP, np.array(rows), placed.view, places=placed.places))
+    columns = made.done()
+    groups = [replace(group, rows=np.isin(np.arange(len(columns.columns)), group.rows))
+              for group in groups]
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
     taken[:len(model.coefficients)] = model.coefficients
@@ -295,39 +302,23 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
                                columns.rows(own))
 
 
-def _groups(columns: TermColumns, names: Iterable[TermName]) -> Iterator[Group]:
-    """Yield the columns of each term, those of each of its views, and those of a linear drift."""
-    of_view = np.array([c.view for c in columns.columns], dtype=int)
-    steady = np.array([c.component.endswith("P1") for c in columns.columns], dtype=bool)
+def _groups(columns: Sequence[Column], names: Iterable[TermName]) -> Iterator[Group]:
+    """Yield the columns of each term, those of each of its views, and those of a linear drift.
+
+    By their indices.
+    """
+    of_view = np.array([c.view for c in columns], dtype=int)
+    steady = np.array([c.component.endswith("P1") for c in columns], dtype=bool)
     for name in names:
-        whole = columns.rows([name])
+        whole = np.array([c.term == name for c in columns], dtype=bool)
         parts = [whole]
         for view in sorted(set(of_view[whole].tolist()) - {-1}):
             here = whole & (of_view == view)
             parts.append(here)
             if name is TermName.DRIFT:
                 parts.append(here & steady)
-        yield from (Group(str(name), rows, places=len(parts)) for rows in parts if rows.any())
-
-
-def _with(ground: TermInputs, before: tuple[TermColumns, list[Group]], columns: TermColumns,
-          groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    """Return columns and groups with further ones appended."""
-    n_before, n_after = len(before[0].columns), len(columns.columns)
-    return joined(ground, before[0], columns), [
-        *(replace(g, rows=np.concatenate([g.rows, np.zeros(n_after, dtype=bool)]))
-          for g in before[1]),
-        *(replace(g, rows=np.concatenate([np.zeros(n_before, dtype=bool), g.rows]))
-          for g in groups)]
-
-
-def _with_readings(model: ModelFit, ground: TermInputs, columns: TermColumns,
-                   groups: list[Group]) -> tuple[TermColumns, list[Group]]:
-    phases = model.problem.system.grid.views.phases.conj()
-    single, suspects = reading_columns(ground, model.found.residuals, phases)
-    return _with(ground, (columns, groups), single, [
-        Group(READING, s.rows, s.view, places=int(np.count_nonzero(ground.weight)),
-              mark=model.problem.system.grid.views.mark_at(*s.place)) for s in suspects])
+        yield from (Group(str(name), np.flatnonzero(rows), places=len(parts))
+                    for rows in parts if rows.any())
 
 
 def select_explanations(pool: Candidates, groups: list[Group],

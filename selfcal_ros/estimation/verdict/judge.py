@@ -30,7 +30,6 @@ from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations,
 from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
-    SearchResult,
     is_searched,
     search_causes,
 )
@@ -84,16 +83,25 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
-    failed = [*_rotation_findings(solved, checked), *_axes_findings(checked),
-              *([] if solved.converged else [Finding("not_converged")]),
-              *_sign_findings(checked, measurements, options)]
-    searched = _with_declared(search_causes(checked, measurements, options, failed=bool(noises)),
-                              options)
-    own = checked is solved
+    own, failed = checked is solved, []
+    if not own and checked.model is not None and checked.model.problem.rigid:
+        failed.append(Finding(
+            "finite_rotation", max(abs(view.phi) for view in checked.result.views), unit="rad",
+            details={"residuals": checked.xy.residuals}))
+    p, size_rad = checked.axes
+    if not p >= MISCLOSURE_LEVEL:
+        failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
+    if not solved.converged:
+        failed.append(Finding("not_converged"))
+    failed += _sign_findings(checked, measurements, options)
+    searched = search_causes(checked, measurements, options, failed=bool(noises))
+    zero = {str(term.name) for term in options.terms if term.size == 0}
+    causes = tuple(replace(cause, details={**cause.details, "declared": 0.0})
+                   if str(cause.name) in zero else cause for cause in searched.causes)
     if own:
         solved = searched.solved
         noises = _noise_findings(solved)
-    failed += _scale_findings(solved if own else checked, measurements, options, searched.causes)
+    failed += _scale_findings(solved if own else checked, measurements, options, causes)
     reference = options.reference
     result = replace(solved.result, reference=None if reference is None else {
         "kind": str(reference.kind), "relative_error": reference.relative_error,
@@ -101,30 +109,21 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
         **({"certified": reference.certified} if reference.certified else {}),
         **({"marks": [*map(list, reference.marks)]} if reference.marks else {})})
     result = with_coverage(enlarged(result, searched.effects))
-    bounded = searched.bounded and (own or not searched.causes) and not _unexplained_noise(solved)
-    grade = (Grade.GOOD if not (failed or noises or searched.causes) else
+    bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)
+    grade = (Grade.GOOD if not (failed or noises or causes) else
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
              Grade.NOT_QUALIFIED)
-    verdict = Verdict(grade, (*failed, *noises), searched.causes,
-                      enlargements(result, searched.terms, [
-                          effect for effect in searched.effects if effect.name != LACK_OF_FIT
-                          or (LACK_OF_FIT, effect.unit) in [
-                              (cause.name, cause.unit) for cause in searched.causes]]))
+    verdict = Verdict(grade, (*failed, *noises), causes, enlargements(result, searched.terms, [
+        effect for effect in searched.effects if effect.name != LACK_OF_FIT
+        or (LACK_OF_FIT, effect.unit) in [(cause.name, cause.unit) for cause in causes]]))
+    untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
-        result, verdict=verdict, findings=(*result.findings, *_visits_findings(checked),
-                                                 *_repeats_findings(measurements),
-                                                 *_untested(solved)),
+        result, verdict=verdict,
+        findings=(*result.findings, *_visits_findings(checked), *_repeats_findings(measurements),
+                  *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
                                           excluded=_excluded(solved, result, options)))
-
-
-def _with_declared(searched: SearchResult, options: Options) -> SearchResult:
-    """Return what was found, with a note on causes that are declared to be exactly zero."""
-    zero = {str(term.name) for term in options.terms if term.size == 0}
-    return replace(searched, causes=tuple(
-        replace(cause, details={**cause.details, "declared": 0.0})
-        if str(cause.name) in zero else cause for cause in searched.causes))
 
 
 def _excluded(solved: Solved, result: CalibrationResult,
@@ -165,14 +164,6 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
     except InputError:
         return solved
     return rigid if MUCH_MORE * rigid.xy.residuals < linear.xy.residuals else linear
-
-
-def _rotation_findings(solved: Solved, checked: Solved) -> list[Finding]:
-    """Return a finding if finite rotations explain the residuals of a linear model."""
-    if checked is solved or checked.model is None or not checked.model.problem.rigid:
-        return []
-    return [Finding("finite_rotation", max(abs(view.phi) for view in checked.result.views),
-                    unit="rad", details={"residuals": checked.xy.residuals})]
 
 
 def _sign_findings(solved: Solved, measurements: Measurements,
@@ -235,18 +226,6 @@ def _noise_findings(solved: Solved) -> list[Finding]:
         "stated": noise.stated, "declared": bool(np.isfinite(noise.declared))})
         for noise, unit in ((solved.xy, "m"), (solved.theta, "rad")) if noise.contradicted]
     return out if np.isfinite(solved.xy.sigma) else [*out, Finding("noise_unknown")]
-
-
-def _axes_findings(solved: Solved) -> list[Finding]:
-    p, size_rad = solved.axes
-    return [] if p >= MISCLOSURE_LEVEL else [
-        Finding("axes_not_met", size_rad, unit="rad", p=p)]
-
-
-def _untested(solved: Solved) -> list[Finding]:
-    """Return a finding if no finer map can test whether the nodes suffice."""
-    untested = solved.model is not None and is_untested(solved.model.problem)
-    return [Finding("roughness_untested")] if untested else []
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:

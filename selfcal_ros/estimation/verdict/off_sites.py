@@ -8,21 +8,16 @@ whole difference. If all views are displaced alike, residuals show neither.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.terms.columns import (
-    AXES,
-    Column,
-    ColumnBuilder,
-    TermColumns,
-    columns_from,
-)
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits
+from selfcal_ros.estimation.terms.columns import AXES, Column, ColumnBuilder
+from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.verdict import Cause
 
@@ -32,52 +27,42 @@ MOST = 6
 """Number of readings that are tested: those with the largest residuals."""
 
 
-class Suspect(NamedTuple):
-    """A reading that may be faulty: its grid view, its mark's place, and a mask of its columns."""
-
-    view: int
-    place: tuple[int, int]
-    rows: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class PlacedSlip:
-    """Columns of a slip at a place known beforehand, its grid view, and number of places tried."""
+    """A slip known beforehand: its grid view, marks read after it, bool (nx, ny), places tried."""
 
-    columns: TermColumns
     view: int
+    after: np.ndarray
     places: int
 
 
-def reading_columns(ground: TermInputs, residuals: np.ndarray,
-                    phases: np.ndarray) -> tuple[TermColumns, list[Suspect]]:
-    """Return the columns of the readings with the largest residuals, and these readings.
+def reading_columns(made: ColumnBuilder, residuals: np.ndarray,
+                    phases: np.ndarray) -> Iterator[tuple[range, int, tuple[int, int]]]:
+    """Add the columns of the readings with the largest residuals.
 
-    Two for each reading: its errors along x and y, stage axes, m.
+    Two for each reading: its errors along x and y, stage axes, m. Yield their indices, the view,
+    and the place of the mark.
 
     Parameters
     ----------
-    ground : TermInputs
-        Inputs of the columns.
+    made : ColumnBuilder
+        The columns.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
     phases : complex array (views,)
         From the stage frame to the plate frame in each view.
     """
-    squares = np.where(ground.weight > 0, ground.weight * abs(residuals) ** 2, -1.0)
+    weight = made.ground.weight
+    squares = np.where(weight > 0, weight * abs(residuals) ** 2, -1.0)
     largest = np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]
-    at = [place for place in zip(*np.unravel_index(largest, squares.shape), strict=True)
-          if squares[place] >= 0]
-    made, found = ColumnBuilder(), []
-    for number, (view, i, j) in enumerate(at):
-        mean = np.zeros(squares.shape[1:], dtype=complex)
-        mean[i, j] = phases[view]
-        shape = made.add({int(view): mean.reshape(-1)}, [None] * len(ground.names))
-        for axis, unit in AXES:
-            made.column(Column(READING, int(view), axis, np.inf), shape, unit)
-        rows = np.arange(2 * len(at)) // 2 == number
-        found.append(Suspect(int(view), (int(i), int(j)), rows))
-    return made.done(ground), found
+    for view, i, j in np.transpose(np.unravel_index(largest, squares.shape)).tolist():
+        if squares[view, i, j] >= 0:
+            mean = np.zeros(squares.shape[1:], dtype=complex)
+            mean[i, j] = phases[view]
+            shape = made.add({view: mean.reshape(-1)})
+            for axis, unit in AXES:
+                made.column(Column(READING, view, axis, np.inf), shape, unit)
+            yield range(len(made.columns) - 2, len(made.columns)), view, (i, j)
 
 
 SLIP = "slip"
@@ -86,35 +71,46 @@ PLACES = 12
 """Number of instants in each view at which a slip is tested."""
 
 
-def slip_columns(ground: TermInputs) -> tuple[TermColumns, dict[tuple[int, float], np.ndarray]]:
-    """Return the columns of slips, and a mask of those of each view and instant.
+def slip_columns(made: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
+    """Add the columns of slips at some instants of the visits; yield indices, view and instant.
 
-    Three for each slip: offset along x and y (stage axes, m), and rotation (m at the half width).
     Views whose visits are unknown have none. An instant is a part of the view's visits, 0..1.
     """
-    columns: list[Column] = []
-    shapes: list[tuple[np.ndarray, tuple[complex, ...]]] = []
-    groups: dict[tuple[int, float], list[int]] = {}
-    for view, visits in enumerate(ground.visits):
+    for view, visits in enumerate(made.ground.visits):
         if visits is None:
             continue
-        for part in np.arange(1, PLACES + 1) / (PLACES + 1):
-            after = _after(visits, float(part))
-            if not 3 <= after.sum() <= len(after) - 3:
-                continue
-            at = ground.z.reshape(-1)[visits.mark]
-            groups[view, float(part)] = list(range(len(columns), len(columns) + 3))
-            columns += [Column(SLIP, view, text, np.inf) for text in ("x", "y", "phi")]
-            shapes += [(after * visits.phase, (1, 1j)), (after * at, (1j,))]
-    columns_made = columns_from(ground, columns, shapes)
-    rows = {key: np.isin(np.arange(len(columns)), at) for key, at in groups.items()}
-    return columns_made, rows
+        rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
+        for part in (np.arange(1, PLACES + 1) / (PLACES + 1)).tolist():
+            after = rank >= round(part * len(rank))
+            if 3 <= after.sum() <= len(after) - 3:
+                at = made.ground.z.reshape(-1)[visits.mark]
+                yield add_slip(made, view, (after * visits.phase, after * at), visits), view, part
 
 
-def _after(visits: ViewVisits, part: float) -> np.ndarray:
-    """Return a mask of the visits after the first `part` of them in time, bool (V,)."""
-    rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
-    return rank >= round(part * len(rank))
+def add_slip(made: ColumnBuilder, view: int, values: tuple[np.ndarray, np.ndarray],
+             visits: ViewVisits | None = None) -> range:
+    """Add the columns of a slip, and return their indices.
+
+    Offset along x and y, stage axes, m, and rotation, m at the half width.
+
+    Parameters
+    ----------
+    made : ColumnBuilder
+        The columns.
+    view : int
+        The grid view.
+    values : tuple of complex array
+        A motion along x, and the places that a rotation moves, plate frame, 0 before the slip: at
+        the visits, (V,), or at the marks, (marks,).
+    visits : ViewVisits, optional
+        The visits.
+    """
+    for one, parts in zip(values, (AXES, (("phi", 1j),)), strict=True):
+        shape = made.add({view: one}) if visits is None else made.add(
+            {view: visits.means(one[None], made.ground.z.size)[0]}, {view: one})
+        for text, unit in parts:
+            made.column(Column(SLIP, view, text, np.inf), shape, unit)
+    return range(len(made.columns) - 3, len(made.columns))
 
 
 OFF_SITES = "off_sites"

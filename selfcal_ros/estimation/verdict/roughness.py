@@ -101,11 +101,6 @@ class Adequacy:
                      effect_rms=self.lack, effect_max=self.lack, details=size)
 
 
-def adequacies_of(model: ModelFit) -> list[Adequacy]:
-    """Return the tests of the map and of the angular map, where they can be made."""
-    return [one for one in (adequacy_of(model), line_adequacy_of(model)) if one is not None]
-
-
 def adequacy_of(model: ModelFit) -> Adequacy | None:
     """Return the test of the map of a fit.
 

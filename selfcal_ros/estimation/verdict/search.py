@@ -22,12 +22,10 @@ from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.verdict.causes import (
     SURE,
     cause_of,
-    effect_of_line,
     fitted_term,
     line_cause,
     noisier_views,
     scatter_of_views,
-    size_cause,
     turned_too_far,
 )
 from selfcal_ros.estimation.verdict.explanations import (
@@ -36,7 +34,7 @@ from selfcal_ros.estimation.verdict.explanations import (
     find_explanations,
 )
 from selfcal_ros.estimation.verdict.off_sites import READING, off_sites_cause
-from selfcal_ros.estimation.verdict.roughness import adequacies_of, maps_to_try
+from selfcal_ros.estimation.verdict.roughness import adequacy_of, line_adequacy_of, maps_to_try
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
@@ -72,7 +70,7 @@ PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
 """Largest plausible size of a term: a larger one is a fault."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SearchResult:
     """Causes that were found, and the solution that allows for them.
 
@@ -80,31 +78,20 @@ class SearchResult:
     ----------
     solved : Solved
         The solution with the terms that the readings show.
-    causes : tuple of Cause
+    causes : list of Cause
         The most likely first.
-    effects : tuple of Effect
+    effects : list of Effect
         Effects that enlarge the uncertainty beyond that of the solution.
-    terms : tuple of str
+    terms : list of str
         Terms whose size was enlarged, or that joined.
     bounded : bool
         Whether solution and effects cover all causes.
     """
 
     solved: Solved
-    causes: tuple[Cause, ...] = ()
-    effects: tuple[Effect, ...] = ()
-    terms: tuple[str, ...] = ()
-    bounded: bool = True
-
-
-@dataclass
-class _Search:
-    """State of a search: see `SearchResult`."""
-
-    solved: Solved
     causes: list[Cause] = field(default_factory=list)
     effects: list[Effect] = field(default_factory=list)
-    joined: list[str] = field(default_factory=list)
+    terms: list[str] = field(default_factory=list)
     bounded: bool = True
 
 
@@ -123,59 +110,63 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     advise : bool
         Whether remedies are tried.
     """
+    found = SearchResult(solved)
     if options.causes is False or solved.model is None:
-        return SearchResult(solved)
+        return found
     sizes = [test for test in solved.model.sizes if test.contradicted]
     place = None if measurements.artifact.map_grid else off_sites_cause(
         solved.model, solved.result.error_map, CAUSE_LEVEL)
     failed = failed or bool(sizes or place)
-    found = _Search(solved)
     system, direct = solved.model.problem.system, solved.model.problem.direct
     if direct and solved.xy.sigma > LEAST_NOISE_M and is_searched(
             system.grid.n_sites, options, failed=failed):
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, _model(found.solved).sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
-              if test.contradicted and test.name not in found.joined}
+              if test.contradicted and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
     plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
     alike = TermName.ROTATION in raised and _as_a_microscope(found, measurements, options)
-    causes = [*(cause for cause in raised.values() if cause is not None), *found.causes]
+    found.causes[:0] = [cause for cause in raised.values() if cause is not None]
     turned = turned_too_far(_model(solved), solved.result, measurements)
     if turned is not None:
         found.bounded = False
-        if TermName.ROTATION not in [cause.name for cause in causes]:
-            causes.append(turned)
-    for rough in adequacies_of(_model(solved)):
+        if TermName.ROTATION not in [cause.name for cause in found.causes]:
+            found.causes.append(turned)
+    for rough in filter(None, (adequacy_of(_model(solved)), line_adequacy_of(_model(solved)))):
         found.effects.append(rough.effect(solved.result))
         if (cause := rough.cause) is not None:
             nodes = _better_map(measurements, options) if advise and not rough.of_lines else ""
-            causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
+            found.causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
     if place is not None:
-        causes = [place.cause, *causes] if place.shown else [*causes, place.cause]
+        found.causes.insert(0 if place.shown else len(found.causes), place.cause)
         found.effects.append(effect_of_field(
             place.cause.name, place.moved, measurements.sense,
             np.zeros(measurements.artifact.angular_count)))
         found.bounded &= place.bounded
-    out = SearchResult(_from_readings(solved, found.joined), tuple(causes), tuple(found.effects),
-                       (*names, *found.joined), found.bounded and plausible)
-    if not advise or not causes:
-        return out
-    tried = out.terms and plausible and not alike
-    model = _best_model(out, measurements, options) if tried else None
-    faulty = (TermName.DRIFT, READING, *([TermName.ROTATION] if turned else []))
-    return replace(out, causes=tuple(_advised(cause, model, out.terms, faulty) for cause in causes))
+    found.solved, found.terms = _from_readings(solved, found.terms), [*names, *found.terms]
+    found.bounded &= plausible
+    if advise and found.causes:
+        tried = found.terms and plausible and not alike
+        model = _best_model(found, measurements, options) if tried else None
+        faulty = (TermName.DRIFT, READING, *([TermName.ROTATION] if turned else []))
+        found.causes = [_advised(cause, model, found.terms, faulty) for cause in found.causes]
+    return found
 
 
 def _better_map(measurements: Measurements, options: Options) -> str:
     """Return the first map (--map) with which nothing contradicts these readings; else empty."""
-    for text, readings in maps_to_try(measurements):
-        solved = solved_with(readings, options, ())
-        if solved is None or solved.xy.contradicted or solved.theta.contradicted:
-            continue
-        if not search_causes(solved, readings, options, failed=False, advise=False).causes:
-            return text
-    return ""
+    return next((text for text, readings in maps_to_try(measurements)
+                 if _uncontradicted(readings, options)), "")
+
+
+def _uncontradicted(measurements: Measurements, options: Options) -> Solved | None:
+    """Return the solution of a model that nothing contradicts; None if it is not."""
+    solved = solved_with(measurements, options, ())
+    if solved is None or solved.xy.contradicted or solved.theta.contradicted:
+        return None
+    again = search_causes(solved, measurements, options, failed=False, advise=False)
+    return None if again.causes else solved
 
 
 def _advised(cause: Cause, model: str | None, terms: Collection[str],
@@ -204,15 +195,12 @@ def _best_model(searched: SearchResult, measurements: Measurements,
     for free in (True, False):
         terms = [ModelTerm(TermName(name)) if free else used[TermName(name)].rounded_up
                  for name in searched.terms]
-        solved = solved_with(measurements, options, terms)
-        if solved is None or solved.xy.contradicted or solved.theta.contradicted:
-            continue
-        emap = solved.result.error_map
-        u = rms(np.stack([emap.u_gx, emap.u_gy])) + np.nan_to_num(rms(emap.u_g_theta))
-        again = search_causes(solved, measurements, replace(
-            options, terms=merged(options.terms, terms)), failed=False, advise=False)
-        if not again.causes and u < least:
-            best, least = ",".join(map(str, merged(options.terms, terms))), u
+        tried = replace(options, terms=merged(options.terms, terms))
+        if (solved := _uncontradicted(measurements, tried)) is not None:
+            emap = solved.result.error_map
+            u = rms(np.stack([emap.u_gx, emap.u_gy])) + np.nan_to_num(rms(emap.u_g_theta))
+            if u < least:
+                best, least = ",".join(map(str, tried.terms)), u
     return best
 
 
@@ -247,7 +235,8 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
     return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
 
-def _search(found: _Search, measurements: Measurements, options: Options, *, failed: bool) -> None:
+def _search(found: SearchResult, measurements: Measurements, options: Options, *,
+            failed: bool) -> None:
     """Add terms while the readings show any; then bound the effects of all other causes."""
     left: list[Explanation] = []
     for _ in range(MAX_JOINED + 1):
@@ -260,7 +249,10 @@ def _search(found: _Search, measurements: Measurements, options: Options, *, fai
         _bound(found, item, measurements)
     if (line := line_cause(_model(found.solved).problem, measurements, CAUSE_LEVEL)) is not None:
         found.causes.append(line)
-        found.effects.append(effect_of_line(line, measurements.artifact))
+        lines = measurements.artifact.angular_count  # the error of a reading at most
+        found.effects.append(Effect(
+            line.name, np.zeros((2, *measurements.artifact.field.shape)),
+            np.full(lines, abs(line.size) / np.sqrt(max(lines, 1)))))
     if not found.causes:
         _noisy_views(found, measurements)
 
@@ -306,26 +298,25 @@ def solved_with(measurements: Measurements, options: Options,
         return None
 
 
-def _join(found: _Search, first: list[Explanation], measurements: Measurements,
+def _join(found: SearchResult, first: list[Explanation], measurements: Measurements,
           options: Options) -> bool:
     """Add the first of equally good explanations to the model; the others enlarge u.
 
     Return whether it joined.
     """
     ground = _model(found.solved).problem.ground
-    names = [*found.joined, first[0].name]
+    names = [*found.terms, first[0].name]
     solved = solved_with(measurements, options, [ModelTerm(TermName(n), START[n]) for n in names])
     if solved is None or not any(test.name == first[0].name and test.contradicted
                                  for test in _model(solved).sizes):
         return False
     for other in first[1:]:
-        instead = [*found.joined, other.name]
-        starts = [ModelTerm(TermName(n), START[n]) for n in instead]
-        twin = solved_with(measurements, options, starts)
+        twin = solved_with(measurements, options, [
+            ModelTerm(TermName(n), START[n]) for n in (*found.terms, other.name)])
         if twin is not None:
             found.effects.append(difference(other.name, twin.result, solved.result))
     found.causes += [cause_of(item, ground) for item in first]
-    found.solved, found.joined = solved, names
+    found.solved, found.terms = solved, names
     found.causes[-len(first)] = cause_of(fitted_term(
         _model(solved), first[0].name, first[0].p, whole=first[0].whole), ground)
     return True
@@ -346,10 +337,12 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     if test.name is TermName.ROTATION and abs(
             (cause := cause_of(held, _model(solved).problem.ground)).size) > SURE * cause.u:
         return cause  # otherwise the readings do not determine which view it is
-    return size_cause(test, term.estimates)
+    largest = max(term.estimates, key=lambda e: abs(e.value))
+    return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
+                 largest.view, details={"given": test.given})
 
 
-def _as_a_microscope(found: _Search, measurements: Measurements, options: Options) -> bool:
+def _as_a_microscope(found: SearchResult, measurements: Measurements, options: Options) -> bool:
     """Return whether a microscope of another scale explains the rotation of lines equally well.
 
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
@@ -372,7 +365,7 @@ def _as_a_microscope(found: _Search, measurements: Measurements, options: Option
     return True
 
 
-def _bound(found: _Search, item: Explanation, measurements: Measurements) -> None:
+def _bound(found: SearchResult, item: Explanation, measurements: Measurements) -> None:
     """Add a cause outside the model, with its effect on the map as far as determined."""
     model = _model(found.solved)
     cause = cause_of(item, model.problem.ground)
@@ -385,7 +378,7 @@ def _bound(found: _Search, item: Explanation, measurements: Measurements) -> Non
         found.effects.append(effect_of_field(item.name, field, measurements.sense, item.turned))
 
 
-def _noisy_views(found: _Search, measurements: Measurements) -> None:
+def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
     """Add the views whose visits scatter more than those of the others.
 
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.

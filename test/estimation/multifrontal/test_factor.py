@@ -41,7 +41,7 @@ def dense(grid):
     full = np.array(rows).conj().T @ np.array(rows)
     marks, both = full[n:, n:], full[:n, n:]
     matrix = full[:n, :n] - both @ np.linalg.pinv(marks) @ both.conj().T
-    matrix[grid.pins, grid.pins] += grid.mean_weight
+    matrix[grid.pins, grid.pins] += grid.weight.sum() / grid.n_readings
     return matrix
 
 

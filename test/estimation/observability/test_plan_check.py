@@ -20,10 +20,9 @@ from selfcal_ros.estimation.observability.plan_check import (
     find_cures,
     predict_plan,
     smaller,
-    unseen_modes,
 )
 from selfcal_ros.estimation.observability.rank import identifies, plan_observability
-from selfcal_ros.estimation.observability.unseen import is_unseen
+from selfcal_ros.estimation.observability.unseen import is_unseen, unseen_modes
 from selfcal_ros.model.view import View
 from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of

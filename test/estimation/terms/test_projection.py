@@ -13,7 +13,6 @@ from selfcal_ros.estimation.terms.projection import (
     project,
     reduce_anew,
     reduce_columns,
-    reduce_lines,
 )
 from selfcal_ros.estimation.terms.shapes import NO_LINES, shapes_of
 from selfcal_ros.model.pose import LatticePose
@@ -82,8 +81,8 @@ def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(sy
     found = np.linalg.pinv(dense, rcond=1e-12) @ columns
     left = columns - dense @ found
     reduced = reduce_columns(grid, shapes)
-    lines = reduce_lines(system.angular, NO_LINES, 0.0, 1.0)
-    projected = project(system, reduced, system.grid_inverse, lines)
+    projected = project(system, reduced, system.grid_inverse, NO_LINES, ratio=0.0,
+                        half_width_m=1.0)
     assert projected.gram == pytest.approx(left.T @ left, abs=1e-9)
     for mine, wanted in zip(projected.fields.T, found[:2 * grid.n_sites].T, strict=True):
         moved = mine - (wanted[::2] + 1j * wanted[1::2])

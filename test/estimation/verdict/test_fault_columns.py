@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.lattice.readings import grid_data
+from selfcal_ros.estimation.terms.columns import ColumnBuilder
 from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.estimation.verdict.off_sites import slip_columns
 from selfcal_ros.model.artifact import Artifact
@@ -24,22 +25,25 @@ def ground():
 
 @pytest.mark.parametrize("view", [0, 1])
 def test_twelve_instants_divide_the_visits_of_a_view_evenly(ground, view):
-    made, rows = slip_columns(ground)
-    parts = [part for number, part in rows if number == view]
+    made = ColumnBuilder(ground)
+    rows = {part: at for at, number, part in slip_columns(made) if number == view}
+    parts = list(rows)
     assert parts == pytest.approx([k / 13 for k in range(1, 13)], abs=1e-15)
     time, mark = ground.visits[view].time, ground.visits[view].mark
     unit = (1, -1j)[view]  # a stage axis in the frame of a plate turned by 90 deg
     for part in parts:
-        x, y, phi = (made.seen[at][view] for at in np.flatnonzero(rows[view, part]))
+        x, y, phi = (made.unit[at] * made.at[made.of_column[at]][view] for at in rows[part])
         after = time >= np.sort(time)[round(49 * part)]
         assert np.array_equal(x, unit * after) and np.array_equal(y, 1j * unit * after)
         assert np.array_equal(phi, 1j * ground.z.ravel()[mark] * after)
 
 
 def test_each_column_moves_its_own_view_alone(ground):
-    made, rows = slip_columns(ground)
-    for (view, _), mine in rows.items():
-        assert [made.columns[at].component for at in np.flatnonzero(mine)] == ["x", "y", "phi"]
-        for at in np.flatnonzero(mine):
+    building = ColumnBuilder(ground)
+    found = list(slip_columns(building))
+    made = building.done()
+    for mine, view, _ in found:
+        assert [made.columns[at].component for at in mine] == ["x", "y", "phi"]
+        for at in mine:
             assert np.flatnonzero(np.abs(made.grid[at]).max(axis=(1, 2))).tolist() == [view]
             assert made.columns[at].view == view

@@ -9,6 +9,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.columns import ColumnBuilder
 from selfcal_ros.estimation.verdict.off_sites import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
@@ -109,10 +110,12 @@ def test_those_with_the_largest_residuals_are_tried():
     ground = prepare(readings, Options())[0].ground
     residuals = np.zeros(ground.weight.shape, dtype=complex)
     residuals[1, 0, 2], residuals[0, 1, 1] = 3e-8j, 2e-8
-    columns, suspects = reading_columns(ground, residuals, np.array([1, -1j, 1]))
-    assert [(s.view, s.place) for s in suspects[:2]] == [(1, (0, 2)), (0, (1, 1))]
+    made = ColumnBuilder(ground)
+    suspects = list(reading_columns(made, residuals, np.array([1, -1j, 1])))
+    columns = made.done()
+    assert [(view, place) for _, view, place in suspects[:2]] == [(1, (0, 2)), (0, (1, 1))]
     assert len(suspects) == MOST and len(columns.columns) == 2 * MOST
-    first = columns.grid[suspects[0].rows]
+    first = columns.grid[np.array(suspects[0][0])]
     assert np.count_nonzero(columns.grid) == 2 * MOST
     assert first[:, 1, 0, 2].tolist() == [-1j, 1]  # stage x, then stage y, in the plate's frame
     assert [c.component for c in columns.columns[:2]] == ["x", "y"]
