@@ -42,6 +42,9 @@ FEW = 0.5
 IN_LINE = 3e-3
 """Least part of a polynomial that places must show, of that of its largest part."""
 
+STEP_M = 1e-6
+"""Half the distance over which the slope of the distortion is taken, small in any camera."""
+
 STEPS = 20
 """Steps from a published offset to the true one; each is shorter by the slope of the distortion."""
 
@@ -290,9 +293,20 @@ def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
     total = np.bincount(visits.mark, weight, len(view.m))
     dx, dy = (np.bincount(visits.mark, weight * part, len(view.m)) / total
               for part in (excess.real, excess.imag))
-    return replace(view, dx=view.dx - dx, dy=view.dy - dy, visits=replace(
+    motion = view.motion and replace(
+        view.motion, products=_straight_products(view.motion.products, camera, place))
+    return replace(view, dx=view.dx - dx, dy=view.dy - dy, motion=motion, visits=replace(
         visits, dx=visits.dx - excess.real, dy=visits.dy - excess.imag,
         offset_x=visits.offset_x - excess.real, offset_y=visits.offset_y - excess.imag))
+
+
+def _straight_products(products: np.ndarray, camera: Distortion, place: complex) -> np.ndarray:
+    """Return products of positions and offsets with the slope of the camera's error removed."""
+    step = STEP_M * np.array([1, 1j])
+    slope = (camera.at(place + step) - camera.at(place - step)) / (2 * STEP_M)
+    change = np.eye(4)
+    change[2:, 2:] -= np.stack([slope.real, slope.imag])
+    return change @ products @ change.T
 
 
 def few_read(measurements: Measurements, camera: Camera | None) -> tuple[Finding, ...]:

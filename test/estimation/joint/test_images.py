@@ -29,12 +29,13 @@ ALONE = Options(assumed=())
 
 
 def measured(image_m: float, seed: int, *, size: int = 7, repeats: int = 1, missing: float = 0.0,
-             sense: Sense = Sense.MICROSCOPE_MOVES, **spread):
+             sense: Sense = Sense.MICROSCOPE_MOVES, servo_m: float = 0.0, **spread):
     """Return truth and readings of two turns with images of 3 x 3 marks."""
     plan, rng = image_plan(size, repeats=repeats), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, 2, rng, Spread(
         **{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread))
-    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense)
+    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=servo_m,
+                            sense=sense)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
 
 
@@ -205,6 +206,22 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
         assert camera["rotation"] == pytest.approx(0.003, abs=1e-4)
         radial = next(c["x"] for c in camera["coefficients"] if c["power"] == [2, 1])
         assert radial == pytest.approx(0.02 / 1.414e-3**2, rel=0.03)
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
+    """Every stop is 1 um off, so that the repeats show the pixel size to 0.1 %."""
+    off = {"microscope_scale": 0.005, "microscope_rotation_rad": -0.02,
+           "microscope_distortion": 0.02, "microscope_field_m": 1.414e-3}
+    for seed in range(3):
+        _, readings = measured(MARK, seed, repeats=4, sense=sense, servo_m=1e-6, **off)
+        assert calibrate(readings).verdict.qualified
+        longer = np.diag([1.0, 1.0, 1.01, 1.01])
+        views = tuple(replace(view, motion=replace(
+            view.motion, products=longer @ view.motion.products @ longer))
+            for view in readings.views)
+        failed = calibrate(replace(readings, views=views)).verdict.failed
+        assert [one.name for one in failed] == ["scale_of_offsets"]
 
 
 def test_degrees_of_freedom_are_those_of_the_maps_variance():
