@@ -140,28 +140,38 @@ def known_beforehand(result: CalibrationResult) -> np.ndarray:
     found = variance_of_reference(result)
     terms = {term.name: term for term in result.model.terms}
     for name, variance in variance_of_terms(result).items():
-        if name not in terms or remaining_part(terms[name]) >= TOLD:  # otherwise an effect
+        if _not_told(terms.get(name)):
             found += variance
     return found
 
 
+def _not_told(term: TermResult | None) -> bool:
+    """Return whether the readings do not determine a term; an effect is none."""
+    return term is None or remaining_part(term) >= TOLD
+
+
 def with_coverage(result: CalibrationResult) -> CalibrationResult:
-    """Return the result with degrees of freedom and k of the XY map's uncertainty.
+    """Return the result with degrees of freedom and k of the uncertainty of both maps.
 
     Without an uncertainty map k is that of the noise.
     """
     noise, emap = result.noise, result.error_map
-    dof = noise.dof_xy
-    power = np.stack([emap.u_gx, emap.u_gy]) ** 2
-    at = np.isfinite(power)
-    known = known_beforehand(result)
-    if not (at.any() and dof > 0 and known[at].any()):
-        return replace(result, noise=replace(noise, dof_map_xy=dof, dof_map_theta=noise.dof_theta))
-    whole = float(power[at].mean())
-    told = max(whole - float(known[at].mean()), 0.0)
-    more = dof * (whole / told) ** 2 if told > 0 else float("inf")
-    return replace(result, noise=replace(noise, dof_map_xy=more, k_xy=coverage_factor(more),
-                                         dof_map_theta=noise.dof_theta))
+    terms = {term.name: term for term in result.model.terms}
+    of_lines = sum((np.asarray(u, dtype=float) ** 2
+                    for name, u in result.extra.get(ANGULAR_KEY, {}).items()
+                    if _not_told(terms.get(name))), np.zeros(emap.u_g_theta.shape))
+    changed: dict[str, float] = {}
+    for kind, power, known in (
+            ("xy", np.stack([emap.u_gx, emap.u_gy]) ** 2, known_beforehand(result)),
+            ("theta", emap.u_g_theta ** 2, of_lines)):
+        dof, at = getattr(noise, f"dof_{kind}"), np.isfinite(power)
+        if dof > 0 and known[at].any():
+            whole = float(power[at].mean())
+            told = max(whole - float(known[at].mean()), 0.0)
+            dof *= (whole / told) ** 2 if told > 0 else float("inf")
+            changed[f"k_{kind}"] = coverage_factor(dof)
+        changed[f"dof_map_{kind}"] = dof
+    return replace(result, noise=replace(noise, **changed))
 
 
 INTERPOLATION = "interpolation"
@@ -227,7 +237,8 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     emap = result.error_map
     for quantity, dof, u in (
             ("xy", result.noise.dof_of("xy"), np.stack([emap.u_gx, emap.u_gy])),
-            ("theta", _dof(result.noise, "theta"), emap.u_g_theta)):
+            ("theta", result.noise.dof_of("theta"), emap.u_g_theta)):
+        dof = dof if dof > 0 else np.inf
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
         at_nodes = sum(line.effect_rms**2 for line in nodes)

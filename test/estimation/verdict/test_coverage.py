@@ -2,6 +2,7 @@
 """One k for the uncertainty of a map: in the result, the summary, the budget and the report."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -12,11 +13,12 @@ from scipy.stats import t as student
 from selfcal_ros.compensation.export import provenance
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.summary.sections import error_section, state_sentence
 from selfcal_ros.simulation.cell import CellSettings
@@ -29,10 +31,10 @@ SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.
 REFERENCE = ReferenceLength("artifact", 0.0, 3e-6)
 
 
-def measured(size=3):
+def measured(size=3, settings=SETTINGS):
     plan, rng = hu_plan(Artifact(size, 0.01, 24), 1), np.random.default_rng(2)
     truth = random_truth(plan.artifact, 4, rng, Spread(phi_rad=1e-4))
-    return simulate_measurements(truth, plan, rng, settings=SETTINGS, visits=True)
+    return simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
 def calibrated(size=3, **how):
@@ -83,6 +85,29 @@ def test_a_term_that_its_size_holds_adds_degrees_of_freedom_and_one_that_is_told
     told = calibrated(5, terms=parse_terms(["microscope:1e-2"], "")).noise
     assert held.dof_map_xy > held.dof_xy
     assert told.dof_map_xy == told.dof_xy
+
+
+def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
+    """By GUM G.2b, with the noise of the lines as the one component of finite degrees."""
+    settings = replace(SETTINGS, sigma_theta_rad=2e-6)
+    result = calibrate(measured(settings=settings), Options(terms=parse_terms(["microscope"], "")))
+    u2 = np.mean(result.error_map.u_g_theta**2)
+    assumed = np.mean(np.square(result.extra["angular_terms"]["line_eccentricity"]))
+    dof = result.noise.dof_theta * (u2 / (u2 - assumed)) ** 2
+    assert 0.01 < assumed / u2 < 1
+    assert result.noise.dof_map_theta == pytest.approx(dof, rel=1e-9)
+    assert result.noise.k_theta == pytest.approx(student.ppf(0.97725, dof), rel=1e-12)
+    assert next(b for b in budgets(result) if b.quantity == "theta").dof == pytest.approx(dof)
+
+
+def test_declared_noise_has_a_budget_with_k_after_it_is_read():
+    found = calibrated()
+    declared = replace(found, noise=replace(found.noise, **dict.fromkeys(
+        ("dof_xy", "dof_map_xy", "dof_theta", "dof_map_theta"), math.inf)))
+    again = result_from_dict(json.loads(json.dumps(plain(result_to_dict(declared)))), "r.json")
+    for budget in budgets(again):
+        assert budget.k == pytest.approx(2.0, abs=1e-4)
+        assert budget.U_rms == pytest.approx(2 * budget.u_rms, rel=1e-4)
 
 
 def test_a_map_without_degrees_of_freedom_has_those_of_its_noise():
