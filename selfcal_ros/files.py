@@ -146,6 +146,16 @@ for _class in (*LOADERS, YamlDumper):
     _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
 
 
+class AsWritten(YamlLoader):
+    """Loader that keeps numbers and dates as the text in the file: 01067 is no octal number."""
+
+
+AsWritten.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in found
+            if tag.rpartition(":")[2] not in ("int", "float", "timestamp")]
+    for first, found in YamlLoader.yaml_implicit_resolvers.items()}
+
+
 def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or first_line(error)
 
@@ -233,14 +243,15 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
                          "give a file that `selfcal` wrote") from error
 
 
-def read_yaml(path: str | os.PathLike) -> Any:
+def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     """Return the YAML value in `path`; InputError names line and column of a fault.
 
-    Floats as in YAML 1.2 and ROS parameter files (`YamlLoader`). The file is a
-    regular one of at most `MAX_YAML_BYTES`.
+    Floats as in YAML 1.2 and ROS parameter files (`YamlLoader`); with `as_written`, numbers and
+    dates as their text. The file is a regular one of at most `MAX_YAML_BYTES`.
     """
     text = read_text(path, MAX_YAML_BYTES)
-    loaders = LOADERS if len(text) < EXPLAINED else LOADERS[:1]
+    loaders = [AsWritten] if as_written else (
+        LOADERS if len(text) < EXPLAINED else LOADERS[:1])
     try:
         for loader in loaders[:-1]:  # several times as fast
             with contextlib.suppress(yaml.YAMLError):

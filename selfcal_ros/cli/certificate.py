@@ -5,11 +5,10 @@ import argparse
 
 from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.cli.trace import deliver, outputs_of
-from selfcal_ros.files import read_yaml
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
 from selfcal_ros.standards.dcc import certificate
-from selfcal_ros.standards.details import details_from_dict
+from selfcal_ros.standards.details import read_details
 from selfcal_ros.standards.statements import is_traceable
 
 
@@ -32,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Read result and details, write the certificate."""
     check_outputs([args.result, args.details], outputs_of(args))
     result = read_result(args.result)
-    details = details_from_dict(read_yaml(args.details), args.details)
+    details = read_details(args.details)
     xml = certificate(result, details, covariance=args.covariance,
                       not_qualified=args.not_qualified)
     traceable = is_traceable(result)

@@ -9,7 +9,7 @@ from pathlib import Path
 from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_json, read_yaml
+from selfcal_ros.files import read_json
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.reporting.chapters import ABOUT
 from selfcal_ros.reporting.figures.maps import map_picture
@@ -18,7 +18,7 @@ from selfcal_ros.reporting.summary.numbers import can_print_symbols
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.results import read_result
 from selfcal_ros.standards.chapter import certificate_chapter
-from selfcal_ros.standards.details import details_from_dict
+from selfcal_ros.standards.details import read_details
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,8 +49,7 @@ def run(args: argparse.Namespace) -> int:
     truth = read_truth(args.truth) if args.truth else None
     more = [table_chapter(result)]
     if args.details:
-        more.append(certificate_chapter(result, details_from_dict(read_yaml(args.details),
-                                                                  args.details)))
+        more.append(certificate_chapter(result, read_details(args.details)))
     with busy("drawing"):
         if args.plot:
             from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """DETAILS.yaml: what a certificate states that no reading tells."""
 
+import math
 import re
 from collections.abc import Callable
 from datetime import date
 from typing import Any
 
 from selfcal_ros.errors import InputError, check_celsius, known_are
+from selfcal_ros.files import read_yaml
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 """Places of a calibration that the schema knows."""
@@ -33,8 +35,11 @@ def _date(value: Any) -> str | None:
 
 
 def _number(value: Any) -> float | None:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
-    return float(value) if good else None
+    try:
+        number = float(value) if not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError):
+        return None
+    return number if abs(number) < 1e9 else None
 
 
 def _choice(*names: str) -> Callable[[Any], str | None]:
@@ -71,6 +76,11 @@ LISTS = ("persons", "conditions", "equipment", "remarks")
 """Sections that are lists of such entries."""
 NEEDED = ("certificate", "laboratory", "customer", "item", "persons", "conditions")
 """Sections that must be there; a list has one entry at least."""
+
+
+def read_details(path: str) -> dict[str, Any]:
+    """Return the details of a certificate in DETAILS.yaml, as `details_from_dict`."""
+    return details_from_dict(read_yaml(path, as_written=True), path)
 
 
 def details_from_dict(data: Any, where: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`selfcal certificate`: the schema's structure, the map's numbers, what is refused."""
 
+import json
 import os
 import re
 from dataclasses import replace
@@ -27,7 +28,7 @@ from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.standards.chapter import certificate_chapter
 from selfcal_ros.standards.dcc import DCC, SI, certificate
-from selfcal_ros.standards.details import details_from_dict
+from selfcal_ros.standards.details import details_from_dict, read_details
 from selfcal_ros.standards.statements import is_traceable
 from test.support.maps import random_map, result_of
 from test.support.truth import hu_plan, random_truth, simulate_measurements
@@ -151,6 +152,20 @@ def test_the_certificate_has_the_parts_of_the_schema_in_their_order():
     assert float(warm.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(0.1)
     empty = [item for item in root.iter() if len(item) == 0 and not (item.text or "").strip()]
     assert not empty
+
+
+def test_details_are_taken_as_they_are_written(tmp_path):
+    given = json.loads(json.dumps(GIVEN, default=str))
+    given["laboratory"]["post_code"], given["item"]["serial_number"] = "@post", "@serial"
+    given["certificate"]["id"] = "@id"
+    text = yaml.safe_dump(given).replace("'@post'", "01067").replace(
+        "'@serial'", "00471").replace("'@id'", "1e3")
+    (tmp_path / "d.yaml").write_text(text)
+    found = read_details(str(tmp_path / "d.yaml"))
+    assert found["laboratory"]["post_code"] == "01067"
+    assert found["item"]["serial_number"] == "00471" and found["certificate"]["id"] == "1e3"
+    assert found["conditions"] == details()["conditions"]
+    assert found["certificate"]["begin"] == details()["certificate"]["begin"]
 
 
 @pytest.mark.skipif(not SCHEMA.exists(), reason="the schema could not be fetched")
