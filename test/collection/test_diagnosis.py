@@ -8,7 +8,7 @@ import pytest
 
 from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
 from selfcal_ros.collection.inputs import REMEDY, Reason
-from selfcal_ros.collection.marks.seen_poses import NamedMarks
+from selfcal_ros.collection.marks.seen_poses import NamedMarks, _fitted
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -318,3 +318,14 @@ def test_marks_on_one_line_do_not_tell_x_from_y():
     told = diagnose(Evidence({"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01,
                              limit_m=0.006))
     assert told.text == REMEDY[Reason.NOT_AT_MARK]
+
+
+def test_the_pose_of_a_plate_is_fitted_through_marks_taken_for_others():
+    """Six of 81 marks, all on one side, seem to be four pitches away."""
+    m, n = (each.ravel() for each in np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)))
+    marks, turn = m + 1j * n, np.exp(0.3j)
+    at = turn * marks + (0.5 - 0.2j)
+    at[(m == 4) & (n > -2)] += 4
+    found, shift, left = _fitted(marks, at, False)
+    assert (found, shift) == (pytest.approx(turn, abs=1e-3), pytest.approx(0.5 - 0.2j, abs=1e-3))
+    assert left < 0.01

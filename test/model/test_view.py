@@ -199,6 +199,16 @@ def test_the_nodes_of_a_map_span_the_plate_unless_their_pitch_is_given(grid, wan
     assert plan_from_dict(plan_with(map=grid), "f").artifact.map_grid == want
 
 
+@pytest.mark.parametrize(("sides", "want"), [([7, 5], (7, 5)), ([5, 7], (5, 7)),
+                                             ([7, 7], (7, 7))])
+def test_a_plate_may_give_both_its_sides(sides, want):
+    """A square one is the same plate as by one number."""
+    plate = plan_from_dict(plan_with(artifact={**PLAN["artifact"], "grid_size": sides}),
+                           "f").artifact
+    assert plate.shape == want
+    assert (plate == replace(PLATE, grid_size=7)) is (sides == [7, 7])
+
+
 def test_a_plan_off_the_lattice_is_written_as_it_is_read():
     plan = plan_from_dict(plan_with(views=[
         {"name": "a"}, {"name": "b", "rotation_deg": -37.25, "translation_pitch": [1.3, -0.7],

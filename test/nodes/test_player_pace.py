@@ -7,7 +7,14 @@ from types import SimpleNamespace
 import pytest
 
 from selfcal_ros.nodes import player
-from selfcal_ros.nodes.player import IMAGES, KINDS, WAITING_IMAGES, WINDOW, Player
+from selfcal_ros.nodes.player import (
+    IMAGES,
+    KINDS,
+    UNHEARD_RATE,
+    WAITING_IMAGES,
+    WINDOW,
+    Player,
+)
 
 T0 = 1_700_000_000_000_000_000
 
@@ -42,6 +49,18 @@ def test_messages_are_due_at_their_own_distances_over_the_rate(monkeypatch, rate
         played.step()
         assert sent == list(range(count))
     assert played.done == (counts[-1] == 5)
+
+
+def test_a_listener_that_tells_nothing_is_sent_more_as_time_passes(monkeypatch):
+    """Counted from the first message: not at once what the age of the clock would allow."""
+    now, sent = [70.0], []
+    monkeypatch.setattr(player.time, "monotonic", lambda: now[0])
+    played = player_of(3 * WINDOW, sent, rate=0.0)
+    played.step()
+    assert len(sent) == WINDOW
+    now[0] += 0.1
+    played.step()
+    assert WINDOW < len(sent) <= WINDOW + 0.1 * UNHEARD_RATE
 
 
 def test_what_the_listener_had_received_before_does_not_widen_the_window(monkeypatch):

@@ -8,6 +8,7 @@ from selfcal_ros.collection.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.vision.detector import MarkDetector, offset
+from selfcal_ros.vision.finding import candidates
 from selfcal_ros.vision.images import Picture
 
 PIXEL = 2e-6
@@ -100,6 +101,16 @@ def test_pixels_are_counted_from_the_centre_of_the_first_one_and_rows_run_down()
         [found] = detector(**given, turn=turn, mirror=mirror).detections(picture(values), 7)[0]
         assert (found.offset_x, found.offset_y) == pytest.approx(expected, abs=1e-11)
         assert found.stamp_ns == 7 and not found.has_id and found.kind == 0
+
+
+def test_a_large_mark_sought_in_a_reduced_image_is_found_to_the_pixel():
+    """One pixel of the image in which it is sought is 12 pixels of this one."""
+    cell = camera(size=100.0, width=401, height=381)
+    for away in np.array([(0.0, 0.0), (3.1, 4.9), (-4.2, 2.3), (5.8, -1.6)]) * PIXEL:
+        image = cell.image(away[:, None], np.random.default_rng(1))
+        [found] = candidates(image, mark="disc", size=100.0, width=20.0, sign=-1)
+        true = cell.pixels_of(away[:, None])[:, 0]
+        assert np.abs(np.subtract((found.column, found.row), true)).max() <= 1
 
 
 def test_the_simulated_camera_and_the_detector_agree_on_turn_and_mirror():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import stdtr
+from scipy.stats import linregress
 
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.collection.marks.repeats import repeat_motion
@@ -14,6 +15,7 @@ from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.checks.wiring import (
     WiringError,
     _p_of,
+    _response,
     check_wiring,
     contradicted_scale,
     wiring_faults,
@@ -21,7 +23,7 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, RepeatMotion, Sense, ViewReadings
 from selfcal_ros.model.view import View
 from test.support.collecting import collect, scene
 
@@ -294,3 +296,14 @@ def test_rejected_kinds_are_in_no_sums():
 @pytest.mark.parametrize("correlation", [0.0, -0.3])
 def test_a_correlation_of_no_sign_or_the_other_one_is_as_probable_as_not(correlation):
     assert _p_of(correlation, 10) == 0.5
+
+
+def test_the_slope_of_a_response_and_its_u_are_those_of_a_line_through_five_values():
+    rng = np.random.default_rng(2)
+    x = rng.normal(0, 60 * NM, 5)
+    values = np.stack([x, 0.9 * x + rng.normal(0, 20 * NM, 5)])
+    about = values - values.mean(axis=1, keepdims=True)
+    response = _response(RepeatMotion(about @ about.T, 4), (0, 0), ("x",))
+    line = linregress(*values)
+    assert response.slope == pytest.approx(line.slope)
+    assert response.u_slope == pytest.approx(line.stderr)

@@ -68,3 +68,14 @@ def test_fields_go_to_the_marks_and_back_as_dense_matrices_take_them():
     assert views.scatter_weight(weight) == pytest.approx(sum(
         (abs(matrix).T @ one.ravel()).reshape(SIDE, SIDE)
         for matrix, one in zip(matrices, weight, strict=True)))
+
+
+@pytest.mark.parametrize("q", range(4))
+@pytest.mark.parametrize("shift", [(5, 0), (0, -7), (9, 9)])
+def test_a_view_that_leaves_the_field_adds_nothing(shift, q):
+    views = LatticeViews((SIDE, SIDE), (LatticePose(q, shift, None), POSES[1]))
+    field, out = np.zeros((2, SIDE, SIDE), dtype=complex)
+    views.add_scattered(out, 0, field + 1)
+    views.subtract_scattered(out, np.array([field + 1, field]), field + 1)
+    assert not out.any() and not views.gather(field + 1)[0].any()
+    assert (views.scatter_weight(np.ones((2, SIDE, SIDE))) == 1).all()

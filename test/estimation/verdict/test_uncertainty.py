@@ -96,14 +96,16 @@ def test_the_difference_of_two_maps_is_theirs_without_a_common_angle(result):
     emap = result.error_map
     gy = emap.gy + 2e-9
     gy[1, 2] = np.nan
-    other = replace(result, error_map=replace(
-        emap, gx=emap.gx - 1e-9, gy=gy, g_theta=emap.g_theta + 7e-6 - np.arange(8) * 1e-6))
+    g_theta = emap.g_theta + 7e-6 - np.arange(8) * 1e-6
+    g_theta[7] = np.nan
+    other = replace(result, error_map=replace(emap, gx=emap.gx - 1e-9, gy=gy, g_theta=g_theta))
     found = difference("rotation", result, other)
     np.testing.assert_allclose(found.xy[0], 1e-9, rtol=1e-6)
     wanted = np.full(emap.gy.shape, -2e-9)
     wanted[1, 2] = 0.0
     np.testing.assert_allclose(found.xy[1], wanted, rtol=1e-6)
-    np.testing.assert_allclose(found.theta, (np.arange(8) - 3.5) * 1e-6, rtol=1e-6)
+    np.testing.assert_allclose(found.theta, np.array([-3, -2, -1, 0, 1, 2, 3, 0]) * 1e-6,
+                               rtol=1e-6, atol=1e-15)
 
 
 def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
