@@ -5,6 +5,7 @@ They are exact, including reference length and terms of the model. Without weigh
 variances of the map are known.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.angular import conditions_for, lines_alone
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.images import images_behind, kept_rotations, share_of
+from selfcal_ros.estimation.joint.images import KEY as IMAGES
+from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
@@ -26,7 +28,7 @@ from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import COMBINED, PRIOR, CalibrationResult
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, shared_rotations
 
 MAX_LINES = 1024
 """Largest number of lines for a full covariance matrix."""
@@ -211,6 +213,58 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
               tuple(index for index, *_ in grid), rotations=kept_rotations(result, len(grid))),
         Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines),
               artifact.harmonics))
+
+
+def share_of(result: CalibrationResult) -> float:
+    """Return the part of the variance of a reading that the marks of an image share; 0 without."""
+    return _kept_number(result, "share", 1.0)
+
+
+def dof_of_marks(result: CalibrationResult) -> float:
+    """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
+    return _kept_number(result, "dof_mark", math.inf)
+
+
+def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
+    try:
+        found = float(result.extra.get(IMAGES, {name: 0.0})[name])
+    except (TypeError, ValueError, KeyError, AttributeError):
+        found = math.nan
+    if not 0 <= found <= most:
+        raise InputError(IMAGES, "no noise of images", "write the result again with `selfcal solve`")
+    return found
+
+
+def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
+    """Return the first of the grid views that have the rotation of each, see `rotations_of`."""
+    if IMAGES not in result.extra:
+        return tuple(range(n_views))
+    placings, steps = zip(*_kept_cells(result, n_views), strict=True)
+    return shared_rotations([placings.index(number) for number in placings], steps)
+
+
+def _kept_cells(result: CalibrationResult, n_views: int) -> list[tuple[int, tuple[int, int]]]:
+    """Return the placing of the plate in each grid view of a result, and the step of its cell."""
+    kept = result.extra[IMAGES]
+    try:
+        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
+            kept["placing"], kept["step"], strict=True)]
+    except (TypeError, ValueError, KeyError, OverflowError):
+        seen = []
+    if len(seen) != n_views or not seen:
+        raise InputError(IMAGES, "no images of these views",
+                         "write the result again with `selfcal solve`")
+    return seen
+
+
+def images_behind(result: CalibrationResult, system: NormalEquations) -> ImageNoise | None:
+    """Return the images behind a result, for `added_covariance` alone; None without images."""
+    if not share_of(result):
+        return None
+    grid = system.grid
+    seen = _kept_cells(result, grid.n_views)
+    return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
+                      np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 
 
 def _is_read(kept: Any) -> bool:

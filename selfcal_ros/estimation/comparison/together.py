@@ -15,15 +15,17 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import (
     MAX_LINES,
     half_width_m,
+    images_behind,
     is_flipped,
     maps_behind,
+    share_of,
     system_behind,
     unit_rows,
 )
 from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.images import ImageNoise, images_behind, share_of
+from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.normal.equations import NormalEquations

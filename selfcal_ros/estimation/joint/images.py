@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.view import View, shared_rotations
+from selfcal_ros.model.view import View
 
 KEY = "images"
 """Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
@@ -219,58 +217,6 @@ def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
     if not any(view.cell is not None for view in views):
         return None
     return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
-
-
-def share_of(result: CalibrationResult) -> float:
-    """Return the part of the variance of a reading that the marks of an image share; 0 without."""
-    return _kept_number(result, "share", 1.0)
-
-
-def dof_of_marks(result: CalibrationResult) -> float:
-    """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
-    return _kept_number(result, "dof_mark", math.inf)
-
-
-def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
-    try:
-        found = float(result.extra.get(KEY, {name: 0.0})[name])
-    except (TypeError, ValueError, KeyError, AttributeError):
-        found = math.nan
-    if not 0 <= found <= most:
-        raise InputError(KEY, "no noise of images", "write the result again with `selfcal solve`")
-    return found
-
-
-def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
-    """Return the first of the grid views that have the rotation of each, see `rotations_of`."""
-    if KEY not in result.extra:
-        return tuple(range(n_views))
-    placings, steps = zip(*_kept_cells(result, n_views), strict=True)
-    return shared_rotations([placings.index(number) for number in placings], steps)
-
-
-def _kept_cells(result: CalibrationResult, n_views: int) -> list[tuple[int, tuple[int, int]]]:
-    """Return the placing of the plate in each grid view of a result, and the step of its cell."""
-    kept = result.extra[KEY]
-    try:
-        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
-            kept["placing"], kept["step"], strict=True)]
-    except (TypeError, ValueError, KeyError, OverflowError):
-        seen = []
-    if len(seen) != n_views or not seen:
-        raise InputError(KEY, "no images of these views",
-                         "write the result again with `selfcal solve`")
-    return seen
-
-
-def images_behind(result: CalibrationResult, system: NormalEquations) -> ImageNoise | None:
-    """Return the images behind a result, for `added_covariance` alone; None without images."""
-    if not share_of(result):
-        return None
-    grid = system.grid
-    seen = _kept_cells(result, grid.n_views)
-    return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
-                      np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 
 
 def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:

@@ -9,9 +9,10 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.comparison.covariance import dof_of_marks, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.joint.images import cells_seen, dof_of_marks, share_of, stops_of
+from selfcal_ros.estimation.joint.images import cells_seen, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
