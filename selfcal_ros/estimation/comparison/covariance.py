@@ -231,7 +231,8 @@ def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
     except (TypeError, ValueError, KeyError, AttributeError):
         found = math.nan
     if not 0 <= found <= most:
-        raise InputError(IMAGES, "no noise of images", "write the result again with `selfcal solve`")
+        raise InputError(IMAGES, "no noise of images",
+                         "write the result again with `selfcal solve`")
     return found
 
 
