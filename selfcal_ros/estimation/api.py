@@ -16,7 +16,7 @@ from selfcal_ros.estimation.joint.camera import (
     straightened,
     yaw_of,
 )
-from selfcal_ros.estimation.joint.images import KEY
+from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
@@ -144,7 +144,7 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
     """Return readings of a known plate corrected by the camera of its calibration."""
     if not measurements.has_images:
         return measurements
-    if KEY not in plate.result.extra:
+    if IMAGES not in plate.result.extra:
         raise InputError(plate.where, "its noise is not separated into that of images and that of "
                          "marks, but the readings have images of several marks",
                          "recheck with one mark an image, or calibrate with such images")

@@ -14,8 +14,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.angular import conditions_for, lines_alone
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.images import KEY as IMAGES
-from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
+from selfcal_ros.estimation.joint.images import IMAGES, ImageNoise, stops_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 
-KEY = "images"
+IMAGES = "images"
 """Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
 degrees of freedom of that of a mark, and of each grid view the `placing` of the plate, a number,
 and the `step` (m, n) of its cell on the plate."""

@@ -23,7 +23,7 @@ from selfcal_ros.estimation.datum.angular import (
 from selfcal_ros.estimation.datum.covariance import MapsCovariance, scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import noise_gain
-from selfcal_ros.estimation.joint.images import KEY, cells_seen, image_noise
+from selfcal_ros.estimation.joint.images import IMAGES, cells_seen, image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
@@ -191,14 +191,14 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
 
 
 def _kept_images(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
-    """Return what a result keeps of the noise of images in its grid views, see `KEY`."""
+    """Return what a result keeps of the noise of images in its grid views, see `IMAGES`."""
     views = [measurements.views[index].view for index in model.problem.grid.index]
     seen = cells_seen(measurements.artifact, views)
     if model.problem.images is None or seen is None:
         return {}
     noises = model.problem.images.noises(model.found.residuals)
     names = list(dict.fromkeys(name for name, _ in seen))
-    return {KEY: {"share": noises.share, "dof_mark": noises.dof_mark,
+    return {IMAGES: {"share": noises.share, "dof_mark": noises.dof_mark,
                   "placing": [names.index(name) for name, _ in seen],
                   "step": [list(step) for _, step in seen]}}
 
