@@ -147,12 +147,12 @@ for _class in (*LOADERS, YamlDumper):
 
 
 class AsWritten(YamlLoader):
-    """Loader that keeps numbers and dates as the text in the file: 01067 is no octal number."""
+    """Loader that keeps scalars as the text in the file: 01067 is no octal number, NO not false."""
 
 
 AsWritten.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in found
-            if tag.rpartition(":")[2] not in ("int", "float", "timestamp")]
+            if tag.rpartition(":")[2] not in ("bool", "int", "float", "timestamp")]
     for first, found in YamlLoader.yaml_implicit_resolvers.items()}
 
 
@@ -246,8 +246,8 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
 def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     """Return the YAML value in `path`; InputError names line and column of a fault.
 
-    Floats as in YAML 1.2 and ROS parameter files (`YamlLoader`); with `as_written`, numbers and
-    dates as their text. The file is a regular one of at most `MAX_YAML_BYTES`.
+    Floats as in YAML 1.2 and ROS parameter files (`YamlLoader`); with `as_written`, all
+    scalars but null as their text. The file is a regular one of at most `MAX_YAML_BYTES`.
     """
     text = read_text(path, MAX_YAML_BYTES)
     loaders = [AsWritten] if as_written else (

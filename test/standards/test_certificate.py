@@ -157,13 +157,16 @@ def test_the_certificate_has_the_parts_of_the_schema_in_their_order():
 def test_details_are_taken_as_they_are_written(tmp_path):
     given = json.loads(json.dumps(GIVEN, default=str))
     given["laboratory"]["post_code"], given["item"]["serial_number"] = "@post", "@serial"
-    given["certificate"]["id"] = "@id"
+    given["certificate"]["id"], given["certificate"]["language"] = "@id", "@no"
+    given["laboratory"]["country"] = "@NO"
     text = yaml.safe_dump(given).replace("'@post'", "01067").replace(
-        "'@serial'", "00471").replace("'@id'", "1e3")
+        "'@serial'", "00471").replace("'@id'", "1e3").replace(
+        "'@no'", "no").replace("'@NO'", "NO")
     (tmp_path / "d.yaml").write_text(text)
     found = read_details(str(tmp_path / "d.yaml"))
     assert found["laboratory"]["post_code"] == "01067"
     assert found["item"]["serial_number"] == "00471" and found["certificate"]["id"] == "1e3"
+    assert (found["laboratory"]["country"], found["certificate"]["language"]) == ("NO", "no")
     assert found["conditions"] == details()["conditions"]
     assert found["certificate"]["begin"] == details()["certificate"]["begin"]
 
