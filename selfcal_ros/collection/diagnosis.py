@@ -40,7 +40,7 @@ STOPPED = 20
 """Number of the last marks of a view at all of which a stage that no longer moves is indicated at
 one place."""
 LATE = 50
-"""Largest number of exposures between which stamps of the wrong time are recognised."""
+"""Largest number of detections between which stamps of the wrong time are recognised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,17 +207,19 @@ def _stage(e: Evidence) -> str | None:
 
 
 def _at_another_time(e: Evidence) -> str | None:
-    """Return that the stage was at the marks some exposures before or after their stamps."""
+    """Return that the stage was at the marks some detections before or after their stamps."""
     if not _away(e, lambda stage: stage) > e.limit_m:
         return None
-    half = sum(len(view.sites) for view in e.marks) / 2
+    placed = [(view.stage, view.sites - view.cells) for view in e.marks]
+    half = sum(len(stage) for stage, _ in placed) / 2
     for steps, late in product(range(1, LATE + 1), (True, False)):
         at, of = (slice(None, -steps), slice(steps, None))[::1 if late else -1]
-        apart = np.concatenate([np.abs(view.stage[at] + view.cells[of] - view.sites[of])
-                                for view in e.marks])
-        if len(apart) >= half and np.quantile(apart, NEARLY_ALL) * e.pitch_m <= e.limit_m:
-            exposures = "1 exposure" if steps == 1 else f"{steps} exposures"
-            return (f"at the stamp of a mark the stage stands where the mark {exposures} "
+        apart = np.concatenate([np.abs(stage[at] - axis[of]) for stage, axis in placed])
+        if len(apart) < half:
+            break
+        if np.quantile(apart, NEARLY_ALL) * e.pitch_m <= e.limit_m:
+            detections = "1 detection" if steps == 1 else f"{steps} detections"
+            return (f"at the stamp of a mark the stage stands where the mark {detections} "
                     f"{'later' if late else 'earlier'} is seen; stamp detections and encoder "
                     "samples with the time of the exposure, by one clock")
     return None

@@ -222,8 +222,8 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
 
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize(("exposures", "where"), [
-    (1, "the mark 1 exposure later"), (3, "the mark 3 exposures later"),
-    (-2, "the mark 2 exposures earlier")])
+    (1, "the mark 1 detection later"), (3, "the mark 3 detections later"),
+    (-2, "the mark 2 detections earlier")])
 def test_stamps_of_another_exposure(exposures, where, sense):
     cell = scene(count=0, repeats=3, sense=sense)
     step = cell.detections[1].stamp_ns - cell.detections[0].stamp_ns
