@@ -294,13 +294,13 @@ def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
     dx, dy = (np.bincount(visits.mark, weight * part, len(view.m)) / total
               for part in (excess.real, excess.imag))
     motion = view.motion and replace(
-        view.motion, products=_straight_products(view.motion.products, camera, place))
+        view.motion, products=straight_products(view.motion.products, camera, place))
     return replace(view, dx=view.dx - dx, dy=view.dy - dy, motion=motion, visits=replace(
         visits, dx=visits.dx - excess.real, dy=visits.dy - excess.imag,
         offset_x=visits.offset_x - excess.real, offset_y=visits.offset_y - excess.imag))
 
 
-def _straight_products(products: np.ndarray, camera: Distortion, place: complex) -> np.ndarray:
+def straight_products(products: np.ndarray, camera: Distortion, place: complex) -> np.ndarray:
     """Return products of positions and offsets with the slope of the camera's error removed."""
     step = STEP_M * np.array([1, 1j])
     slope = (camera.at(place + step) - camera.at(place - step)) / (2 * STEP_M)

@@ -11,6 +11,7 @@ from scipy.stats import binom
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.joint.camera import Distortion, straight_products
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
@@ -222,6 +223,23 @@ def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
             for view in readings.views)
         failed = calibrate(replace(readings, views=views)).verdict.failed
         assert [one.name for one in failed] == ["scale_of_offsets"]
+
+
+def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
+    """True offsets are minus the motion; published ones have the camera's error, (x, y) mixed."""
+    rng, place = np.random.default_rng(4), 3e-4 - 2e-4j
+    camera = Distortion(((1, 0), (0, 1), (2, 1)),
+                        np.array([0, 0.004 + 0.03j, 0.002 - 0.005j, 2e4 + 1e4j]))
+    true = place + rng.normal(0, 1e-7, 500) + 2e-7j * rng.normal(0, 1, 500)
+    published = true.copy()
+    for _ in range(30):
+        published = true + camera.at(published)
+    moved, seen = -(true - true.mean()), published - published.mean()
+    rows = np.stack([moved.real, moved.imag, seen.real, seen.imag])
+    slopes = straight_products(rows @ rows.T, camera, complex(published.mean()))
+    on_motion = np.linalg.solve(slopes[:2, :2], slopes[:2, 2:])
+    np.testing.assert_allclose(on_motion, -np.eye(2), atol=2e-5)
+    assert abs(np.linalg.solve(slopes[:2, :2], (rows @ rows.T)[:2, 2:]) + np.eye(2)).max() > 0.02
 
 
 def test_degrees_of_freedom_are_those_of_the_maps_variance():
