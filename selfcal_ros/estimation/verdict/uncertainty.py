@@ -235,10 +235,8 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     """
     lines, found = result.budget or tuple(budget_lines(result)), []
     emap = result.error_map
-    for quantity, dof, u in (
-            ("xy", result.noise.dof_of("xy"), np.stack([emap.u_gx, emap.u_gy])),
-            ("theta", result.noise.dof_of("theta"), emap.u_g_theta)):
-        dof = dof if dof > 0 else np.inf
+    for quantity, u in (("xy", np.stack([emap.u_gx, emap.u_gy])), ("theta", emap.u_g_theta)):
+        dof = _or_infinite(result.noise.dof_of(quantity))
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
         at_nodes = sum(line.effect_rms**2 for line in nodes)
@@ -279,7 +277,10 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
 
 def _dof(noise: Noise, kind: str) -> float:
     """Return the degrees of freedom of the noise behind the map; infinite if unknown."""
-    dof = float(getattr(noise, f"dof_{kind}"))
+    return _or_infinite(float(getattr(noise, f"dof_{kind}")))
+
+
+def _or_infinite(dof: float) -> float:
     return dof if dof > 0 else np.inf
 
 
