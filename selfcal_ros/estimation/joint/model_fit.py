@@ -21,6 +21,7 @@ from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, si
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     TermEquations,
+    free_inverse,
     next_coefficients,
     residual_sums,
     score,
@@ -54,6 +55,9 @@ laid millimetres beside their places make the offsets, and their rounding, as la
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance, or of the weight of lines that have terms of
 their own, from which the terms' equations are set up anew."""
+
+FEW_DOF = 10
+"""Degrees of freedom of grid residuals below which those of lines count for the noise as well."""
 
 OFFSET_STEPS = 10
 """Largest number of steps in which noise is removed from the microscope's offsets again."""
@@ -281,9 +285,13 @@ class _State:
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
-        sums = residual_sums(equations, now)
+        inverse = free_inverse(equations)
+        sums = residual_sums(equations, now, inverse)
+        total, dof = _of_lines(self.problem, self.found, equations, inverse, inverse @ now.total)
+        if sums.dof_between - dof < FEW_DOF or total > sums.between:
+            total, dof = 0.0, 0.0
         self.problem = replace(
-            self.problem, residuals_xy=sigma_of(sums.between, sums.dof_between),
+            self.problem, residuals_xy=sigma_of(sums.between - total, sums.dof_between - dof),
             repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
             else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
@@ -338,3 +346,28 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
     return total, dof
+
+
+def _of_lines(problem: Problem, found: JointFit, equations: TermEquations, inverse: np.ndarray,
+              more: np.ndarray) -> tuple[float, float]:
+    """Return the part of lines in `squares` and their degrees of freedom, all columns free.
+
+    The weight of lines is that of the grid's noise over theirs. If that noise contained their
+    residuals, either would grow with the other wherever lines agree less well than marks do.
+
+    Parameters
+    ----------
+    problem, found, equations : Problem, JointFit, TermEquations
+        A solution, and the columns about it.
+    inverse, more : float arrays (p, p), (p,)
+        `free_inverse` of the columns, and their free coefficients less those of the solution.
+    """
+    if not (found.ratio > 0 and len(found.inverse)):
+        return 0.0, 0.0
+    system, angular = problem.system, problem.system.angular
+    columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
+    weight = equations.line_weight * angular.weight
+    rotations = found.ratio * found.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
+    followed = np.einsum("vk,vkp,vkq->pq", weight, columns, columns) * inverse
+    return (float((weight * (found.residuals_theta - columns @ more) ** 2).sum()),
+            angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()))

@@ -297,12 +297,11 @@ def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
     return Score(between, within.right - within.gram @ taken, sums)
 
 
-def residual_sums(equations: TermEquations, found: Score) -> Sums:
-    """Return the residuals of all columns with free coefficients.
+def residual_sums(equations: TermEquations, found: Score, inverse: np.ndarray) -> Sums:
+    """Return the residuals of all columns with free coefficients, given their `free_inverse`.
 
     The noise comes from this fit: a size that is too small would leave part of its term.
     """
-    inverse = free_inverse(equations)
     more = inverse @ found.total
     gram, within = equations.projected.gram, equations.columns.within.gram
     between = found.sums.between - 2 * more @ found.between + more @ gram @ more

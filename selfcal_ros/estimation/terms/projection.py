@@ -155,6 +155,16 @@ class ProjectedColumns:
         """Map F, complex (sites, p)."""
         return self.make_fields()
 
+    def of_lines(self, system: NormalEquations, lines: LineColumns,
+                 half_width_m: float) -> np.ndarray:
+        """Return the angular residuals of the columns, (views, K, p), rad."""
+        angular = system.angular
+        phi = self.parameters[system.phi_at] / half_width_m
+        out = angular.gather(self.turned) - phi[:, None]
+        if len(lines.at):
+            out[:, :, lines.at] += np.moveaxis(lines.values, 0, -1)
+        return np.where(angular.read[:, :, None], angular.centred(out), 0.0)
+
 
 def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
             lines: LineColumns, *, ratio: float, half_width_m: float) -> ProjectedColumns:

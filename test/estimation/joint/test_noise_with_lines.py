@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The noise of marks where lines are read as well, whose noise it weighs against."""
+
+from collections import Counter
+
+import numpy as np
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.verdict import Grade
+from selfcal_ros.simulation.cell import CellSettings
+from selfcal_ros.simulation.machine import Spread, random_truth
+from test.support.truth import hu_plan, simulate_measurements
+
+NOISE = 10e-9
+
+
+def calibrated(seed):
+    plan, rng = hu_plan(Artifact(6, 0.01, 24, 4), repeats=2), np.random.default_rng(seed)
+    truth = random_truth(plan.artifact, 4, rng, Spread(
+        rotation="finite", phi_rad=1e-3, t_m=2e-5, microscope_rotation_rad=0.01))
+    settings = CellSettings(sigma_xy_m=NOISE, sigma_theta_rad=2e-6, servo_sigma_m=3e-7)
+    return calibrate(simulate_measurements(truth, plan, rng, settings=settings, visits=True))
+
+
+def test_residuals_of_few_marks_show_their_own_noise_and_not_that_of_lines():
+    results = [calibrated(seed) for seed in range(40)]
+    grades = Counter(result.verdict.grade for result in results)
+    assert not grades[Grade.NOT_QUALIFIED]  # 13 of them with the residuals of lines counted
+    noises = [result.noise for result in results]
+    dof = np.array([noise.dof_xy_residuals for noise in noises])
+    found = np.array([noise.sigma_xy_residuals for noise in noises]) ** 2 / NOISE**2
+    assert abs(dof @ found / dof.sum() - 1) < 4 * np.sqrt(2 / dof.sum())
+    assert abs(np.mean(dof * (found - 1) ** 2) / 2 - 1) < 0.8  # as scattered as they say
