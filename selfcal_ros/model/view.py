@@ -4,6 +4,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -288,6 +289,17 @@ def shared_rotations(placings: Sequence[int],
             for placing in placings}
     return tuple(placing if all(len(set(along)) > 1 for along in zip(*seen[placing], strict=True))
                  else row for row, placing in enumerate(placings))
+
+
+CellsSeen = Sequence[tuple[Any, tuple[int, int]]]
+"""Of each grid view its name in the plan, and the step of its cell on the plate."""
+
+
+def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
+    """Return the cells of images that grid views are; None without images."""
+    if not any(view.cell is not None for view in views):
+        return None
+    return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
 
 
 @dataclass(frozen=True)

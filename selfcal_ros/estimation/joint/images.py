@@ -10,7 +10,6 @@ noise make of them, the yaw of the stage fitted to them as to the readings.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from selfcal_ros.estimation.normal.systems import Memo
 from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import CellsSeen, View, cells_seen
 
 IMAGES = "images"
 """Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
@@ -207,16 +206,6 @@ def image_noise(artifact: Artifact, views: Sequence[View],
 
 
 _known: Memo[tuple, ImageNoise] = Memo()
-
-CellsSeen = Sequence[tuple[Any, tuple[int, int]]]
-"""Of each grid view its name in the plan, and the step of its cell on the plate."""
-
-
-def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
-    """Return the cells of images that grid views are; None without images."""
-    if not any(view.cell is not None for view in views):
-        return None
-    return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
 
 
 def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:

@@ -23,7 +23,7 @@ from selfcal_ros.estimation.datum.angular import (
 from selfcal_ros.estimation.datum.covariance import MapsCovariance, scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import noise_gain
-from selfcal_ros.estimation.joint.images import IMAGES, cells_seen, image_noise
+from selfcal_ros.estimation.joint.images import IMAGES, image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
@@ -63,7 +63,7 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import Plan, cells_seen
 
 
 def solve_joint(measurements: Measurements, options: Options) -> Solved:

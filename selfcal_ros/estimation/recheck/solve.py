@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
-from selfcal_ros.estimation.joint.images import cells_seen, stops_of
+from selfcal_ros.estimation.joint.images import stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
@@ -60,6 +60,7 @@ from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
+from selfcal_ros.model.view import cells_seen
 
 KEY = "recheck"
 """Key of what a recheck found among the extras of a result."""
