@@ -48,7 +48,7 @@ soak: setup  # e.g. make soak HOURS=8 SIZE=21
 chaos: setup  # minutes; e.g. make chaos ROUNDS=3 SEED=7
 	@$(BIN)/python tools/chaos.py $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(SEED),--seed $(SEED))
 mutants: setup  # e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
-	@$(BIN)/python tools/mutants.py $(MUTANTS)
+	@$(BIN)/python -m tools.mutants $(MUTANTS)
 reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
 	@$(BIN)/python -m tools.reality $(REALITY)
 pictures: setup  # those of README and docs

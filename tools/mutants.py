@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Change the code a little, run the tests that watch it, and print the changes that no test sees.
 
-    tools/mutants.py [--number N] [--seed S] [--only PATH]... [--skip N] [--near]
+    python -m tools.mutants [--number N] [--seed S] [--only PATH]... [--skip N] [--watch]
 
 A sample of small changes (a sign, a comparison, a factor, sin for cos, min for max, an index) over
 selfcal_ros, without text and plots. Each is made in a copy of the tree, never in the tree itself.
-Tests that mirror the module run first, then those that import it, then those of the packages that
-use it, in one process and up to the first that fails. A change that makes the tests hang counts as
-seen; a test that fails without any change does not count.
+Only tests that enter the changed function run (tools/watched.py notes them once, in the time of the
+whole suite), those of the module's own test file first, in one process and up to the first that
+fails. A change that makes the tests hang counts as seen; a test that fails without any change does
+not count.
 """
 
 import argparse
@@ -17,7 +18,6 @@ import contextlib
 import hashlib
 import importlib
 import os
-import re
 import resource
 import shutil
 import signal
@@ -26,13 +26,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from operator import itemgetter
 from pathlib import Path
 
 import pytest
+
+from tools.watched import KEPT, Watched
 
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_libraries, "1")
@@ -50,15 +52,6 @@ TEST_CPU_S = 120
 
 TIMEOUT_S = 3600
 """Time of a group of tests beyond which it waits for what does not come."""
-
-WIDER = {"estimation": ["test/estimation"], "laser": ["test/laser"],
-         "aerotech": ["test/aerotech"], "compensation": ["test/compensation"],
-         "model": ["test/model", "test/estimation"],
-         "simulation": ["test/simulation"], "collection": ["test/collection"],
-         "messages": ["test/messages", "test/bagio"], "bagio": ["test/bagio"],
-         "sessions": ["test/sessions"], "nodes": ["test/nodes"]}
-WITH_PROCESSES = ("nodes", "cli", "launch", "shipped", "bench")
-"""Tests that start processes of their own: they watch the modules of their own package alone."""
 
 COMPARE = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
            ast.Eq: ("==", "!="), ast.NotEq: ("!=", "==")}
@@ -188,71 +181,6 @@ def _in_lot(seed: int, name: str, text: str) -> list[tuple[str, Mutant]]:
     return out
 
 
-IMPORT = re.compile(r"^[ \t]*(?:from[ ]+([\w.]+)[ ]+import[ ]+(\([^)]*\)|[^\n]*)"
-                    r"|import[ ]+([^\n]*))", re.MULTILINE)
-"""An import where a line begins: all files parsed would take seconds."""
-
-
-def _imported(path: Path, known: set[str]) -> set[str]:
-    """Return the modules among `known` that a file names in its imports."""
-    found = set()
-    for module, names, modules in IMPORT.findall(path.read_text()):
-        found |= {module, *(f"{module}.{name}" for name in re.findall(r"\w+", names)),
-                  *re.findall(r"[\w.]+", modules)}
-    return found & known
-
-
-def _dotted(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-
-
-@cache
-def _steps() -> dict[str, set[str]]:
-    """Return the modules that each file of the package and of the tests imports."""
-    files = {_dotted(path): path for folder in (PACKAGE, ROOT / "test")
-             for path in sorted(folder.rglob("*.py"))}
-    return {name: _imported(path, set(files)) for name, path in files.items()}
-
-
-def users_of(path: str, distance: int) -> list[str]:
-    """Return the test files that import a module over at most `distance` steps."""
-    users, near = {_dotted(ROOT / path)}, {_dotted(ROOT / path)}
-    for _ in range(distance):
-        near = {name for name, imported in _steps().items() if imported & near} - users
-        users |= near
-    return sorted(f"{name.replace('.', '/')}.py" for name in users
-                  if name.split(".")[-1].startswith("test_"))
-
-
-def tests_for(path: str, *, near: bool = False) -> list[list[str]]:
-    """Return the tests that watch a module, the likeliest first, each named once.
-
-    First its mirror, then the tests that import it, then those of its folder, then those of the
-    packages that use it as far as they reach it through imports. `near`: those that mirror or
-    import it, or else those of its folder.
-    """
-    parts = Path(path).with_suffix("").parts[1:]
-    mirror = ROOT.joinpath("test", *parts[:-1])
-    folders = [ROOT / folder for folder in WIDER.get(parts[0], [])]
-    reached = set(users_of(path, 99))
-    own = sorted(mirror.glob(f"test_{parts[-1]}*.py"))
-    groups = [own, [ROOT / name for name in users_of(path, 1)],
-              sorted(mirror.glob("test_*.py")),
-              [file for folder in folders for file in sorted(folder.rglob("test_*.py"))
-               if str(file.relative_to(ROOT)) in reached]]
-    done: set[Path] = set()
-    found = []
-    for group in groups:
-        names = [file for file in group if file not in done]
-        done |= set(group)
-        found.append([str(file.relative_to(ROOT)) for file in names
-                      if parts[0] in WITH_PROCESSES
-                      or file.relative_to(ROOT).parts[1] not in WITH_PROCESSES])
-    if near:
-        found = found[:2] if any(found[:2]) else found[2:3]
-    return [group for group in found if group]
-
-
 def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
     """Return what `run` returns in a process of its own, None if it takes too long.
 
@@ -291,10 +219,14 @@ def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
 
 
 class FirstFailed:
-    """A plugin of pytest: ends tests that hang, keeps the name of the first that fails."""
+    """A plugin of pytest: runs chosen tests, ends those that hang, keeps the first that fails."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, tests: Sequence[str], path: Path) -> None:
+        self.tests, self.path = set(tests), path
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Leave out what was not chosen."""
+        items[:] = [item for item in items if item.nodeid in self.tests]
 
     def pytest_runtest_setup(self) -> None:
         """Give the next test its processor time."""
@@ -330,23 +262,25 @@ class Tree:
 
     def failing(self, tests: list[str]) -> str | None:
         """Return the first test that fails, or "time" if they take too long; None if all pass."""
-        unsound = [f"--deselect={test}" for test, sound in self.sound.items() if not sound]
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *unsound]
+        tests = [test for test in tests if self.sound.get(test, True)]
+        files = list(dict.fromkeys(test.split("::")[0] for test in tests))
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
         first = self.folder.with_name("first_failed")
         first.unlink(missing_ok=True)
         status = _in_a_fork(
-            lambda: pytest.main([*options, *tests], plugins=[FirstFailed(first)]), self.folder)
+            lambda: pytest.main([*options, *files], plugins=[FirstFailed(tests, first)]),
+            self.folder)
         if status in (None, -signal.SIGXCPU):
             return "time"
         if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
             return None
         return first.read_text() if first.exists() else "start"
 
-    def survives(self, mutant: Mutant, *, near: bool = False) -> bool:
-        """Return whether no test sees the change; `near`: none that imports the module."""
+    def survives(self, mutant: Mutant, groups: list[list[str]]) -> bool:
+        """Return whether none of the tests sees the change."""
         path = self.folder / mutant.path
         text = path.read_text()
-        for group in tests_for(mutant.path, near=near):
+        for group in groups:
             while True:
                 path.write_text(mutant.applied(text))
                 try:
@@ -376,17 +310,24 @@ def main() -> int:
     parser.add_argument("--only", action="append", default=[], metavar="PATH",
                         help="file or folder, e.g. selfcal_ros/estimation; may be repeated")
     parser.add_argument("--skip", type=int, default=0, help="leave out the first of the sample")
-    parser.add_argument("--near", action="store_true",
-                        help="only the tests that mirror or import the module: minutes instead of "
-                        "hours; what survives is to be tried again without")
+    parser.add_argument("--seconds", type=float, default=600,
+                        help="time of the tests of one change, as in the suite (default: 600)")
+    parser.add_argument("--watch", action="store_true",
+                        help="note anew which functions each test enters")
     args = parser.parse_args()
+    if args.watch or not list(KEPT.glob("*.json")):
+        shutil.rmtree(KEPT, ignore_errors=True)
+        print("noting which functions each test enters: in the time of the whole suite", flush=True)
+        subprocess.run([sys.executable, "-m", "pytest", "-p", "tools.watched", "-q", "-n", "2",
+                        "--dist", "loadfile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
     survivors = 0
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         tree = Tree(Path(folder) / "tree")
+        watched = Watched(KEPT, tree.folder)
         chosen = sample(args.number, args.seed, args.only, root=tree.folder)[args.skip:]
         for number, mutant in enumerate(chosen, args.skip + 1):
             line = (tree.folder / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
-            alive = tree.survives(mutant, near=args.near)
+            alive = tree.survives(mutant, watched.groups(mutant.path, mutant.line, args.seconds))
             survivors += alive
             print(f"{number}/{args.number} {'SURVIVED' if alive else 'seen'}: {mutant.path}:"
                   f"{mutant.line}: {line}  -> {mutant.new}", flush=True)

@@ -3,11 +3,15 @@
 
 import ast
 import importlib.util
+import json
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tools import watched
 
 ROOT = Path(__file__).parents[2]
 SPEC = importlib.util.spec_from_file_location("mutants", ROOT / "tools/mutants.py")
@@ -90,36 +94,142 @@ def test_what_changes_elsewhere_leaves_the_sample_as_it_was(tmp_path):
     assert lines(20) == after[:20] != sorted(after)[:20]
 
 
-def test_the_tests_that_mirror_a_module_run_first_and_each_runs_once():
-    groups = mutants.tests_for("selfcal_ros/estimation/joint/problem.py")
-    assert groups[0] == ["test/estimation/joint/test_problem.py"]
-    assert "test/estimation/joint/test_statistics.py" in groups[1]  # imports the module
-    assert "test/estimation/joint/test_recovery.py" in groups[2]  # stands beside it
-    named = [name for group in groups for name in group]
-    assert len(set(named)) == len(named) and all((ROOT / name).is_file() for name in named)
-    assert "test/estimation/comparison/test_maps.py" in named  # reaches it through others
+FILE = """LIMIT = 3
 
 
-def test_near_tests_mirror_or_import_the_module_or_stand_in_its_folder():
-    path = "selfcal_ros/estimation/joint/problem.py"
-    assert mutants.tests_for(path, near=True) == mutants.tests_for(path)[:2]
-    alone = "selfcal_ros/collection/approach.py"
-    assert "test/collection/test_approach.py" in mutants.tests_for(alone, near=True)[0]
+class Plan:
+    size: int = 2
+
+    def check(self):
+        return sum(self.size < one for one in range(LIMIT))
 
 
-def test_the_users_of_a_module_are_those_that_import_it_over_some_steps():
-    near = mutants.users_of("selfcal_ros/estimation/joint/problem.py", 1)
-    assert "test/estimation/joint/test_problem.py" in near
-    assert set(near) < set(mutants.users_of("selfcal_ros/estimation/joint/problem.py", 3))
-    far = mutants.users_of("selfcal_ros/estimation/joint/problem.py", 99)
-    assert "test/model/test_visit_order.py" not in far
+def other():
+    return 4
+"""
+
+
+def noted(tmp_path):
+    """Return a tree of one module, and which of its functions five tests entered."""
+    (tmp_path / "selfcal_ros/model").mkdir(parents=True)
+    (tmp_path / "selfcal_ros/model/plan.py").write_text(FILE)
+    name = "selfcal_ros/model/plan.py"
+    check, other, third = f"{name}:Plan.check", f"{name}:other", "selfcal_ros/files.py:third"
+    (tmp_path / "gw0.json").write_text(json.dumps({
+        "seconds": {"test/a.py::one": 2, "test/a.py::two": 1,
+                    "test/model/test_plan_more.py::one": 50},
+        "entered": {"": [third], "test/a.py": [third], "test/a.py::one": [check, other],
+                    "test/model/test_plan_more.py::one": [check, other, third]}}))
+    (tmp_path / "gw1.json").write_text(json.dumps({
+        "seconds": {"test/nodes/b.py::one": 3, "test/c.py::one": 40},
+        "entered": {"test/nodes/b.py": [], "test/c.py::one": [check]}}))
+    return name, watched.Watched(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize(("line", "functions"), [
+    (1, ["Plan.check"]), (5, ["Plan.check"]), (8, ["Plan.check"]), (12, ["other"]),
+    (10, ["Plan.check", "other"])])
+def test_a_line_is_used_by_the_function_around_it_or_those_that_name_it(
+        tmp_path, line, functions):
+    name, _ = noted(tmp_path)
+    assert watched.functions_at(name, line, tmp_path) == {f"{name}:{one}" for one in functions}
+
+
+def test_only_tests_that_enter_the_function_run_and_its_mirror_first(tmp_path):
+    name, kept = noted(tmp_path)
+    mirror = "test/model/test_plan_more.py::one"
+    assert kept.groups(name, 8, 600) == [[mirror, "test/c.py::one", "test/a.py::one"]]
+    assert kept.groups(name, 12, 600) == [[mirror, "test/a.py::one"]]
+    assert kept.groups(name, 8, 45) == [["test/c.py::one", "test/a.py::one"]]  # in 45 s
+    (tmp_path / "selfcal_ros/files.py").write_text("def third():\n    return 1\n")
+    assert kept.groups("selfcal_ros/files.py", 2, 600) == [  # entered by the fixtures of a.py
+        ["test/a.py::two", "test/a.py::one", mirror]]
+
+
+def test_tests_that_start_processes_watch_their_whole_package(tmp_path):
+    _, kept = noted(tmp_path)
+    (tmp_path / "selfcal_ros/nodes").mkdir()
+    (tmp_path / "selfcal_ros/nodes/solver.py").write_text("def spin():\n    return 1\n")
+    assert kept.groups("selfcal_ros/nodes/solver.py", 2, 600) == [["test/nodes/b.py::one"]]
+
+
+def test_the_first_files_are_tried_before_many_others(tmp_path):
+    (tmp_path / "selfcal_ros").mkdir()
+    (tmp_path / "selfcal_ros/files.py").write_text("def third():\n    return 1\n")
+    tests = [f"test/{number:02}.py::one" for number in range(9)]
+    (tmp_path / "main.json").write_text(json.dumps({
+        "seconds": dict.fromkeys(tests, 6),
+        "entered": {test: ["selfcal_ros/files.py:third"] * (1 + number)
+                    for number, test in enumerate(tests)}}))
+    assert watched.Watched(tmp_path, tmp_path).groups("selfcal_ros/files.py", 2, 600) == [
+        tests[:4], tests[4:]]
+
+
+WATCHING = """
+import sys
+from pathlib import Path
+import pytest
+import tools.watched as watched
+here = Path(sys.argv[1])
+watched.ROOT, watched.PACKAGE, watched.KEPT = here, f"{here}/package/", here / "kept"
+sys.path.insert(0, str(here))
+sys.exit(pytest.main(["-q", "-p", "no:cacheprovider", str(here)], plugins=[watched.Watch()]))
+"""
+PACKAGE = """
+def double(x):
+    return sum(2 * one for one in [x])
+
+
+def at_import():
+    return 3
+
+
+def in_fixture():
+    return 4
+"""
+TESTS = """
+import pytest
+from package.sums import at_import, double, in_fixture
+
+THREE = at_import()
+
+
+@pytest.fixture(scope="module")
+def four():
+    return in_fixture()
+
+
+def test_one(four):
+    assert double(2) == four
+
+
+def test_two(four):
+    assert double(2) == four
+
+
+def test_three():
+    assert THREE == 3
+"""
+
+
+def test_what_tests_their_fixtures_and_their_file_enter_is_noted(tmp_path):
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package/sums.py").write_text(PACKAGE)
+    (tmp_path / "test_sums.py").write_text(TESTS)
+    subprocess.run([sys.executable, "-c", WATCHING, str(tmp_path)], cwd=ROOT, check=True,
+                   stdout=subprocess.DEVNULL)
+    kept = watched.Watched(tmp_path / "kept", tmp_path)
+    tests = [f"test_sums.py::test_{name}" for name in ("one", "two", "three")]
+    assert set(kept.seconds) == set(tests)
+    assert kept.tests["package/sums.py:double"] == set(tests[:2])
+    assert kept.tests["package/sums.py:at_import"] == set(tests)
+    assert kept.tests["package/sums.py:in_fixture"] == set(tests)
 
 
 def small_tree(tmp_path, monkeypatch, test):
     """Return a copy in which `half` of a module is watched by one test."""
     monkeypatch.setattr(mutants.Tree, "__init__", lambda self, folder: self.__dict__.update(
         folder=folder, sound={}))
-    monkeypatch.setattr(mutants, "tests_for", lambda path, near: [["test/test_half.py"]])
     folder = tmp_path / "tree"
     (folder / "test").mkdir(parents=True)
     shutil.copy2(ROOT / "pyproject.toml", folder)  # also turns off plugins of an installed ROS
@@ -145,7 +255,8 @@ def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     tree = small_tree(tmp_path, monkeypatch, test)
     divided, = (m for m in mutants.mutants_of("half.py", HALF) if m.new == "*")
-    assert tree.survives(divided) is survives
+    tests = ["test/test_half.py::test_half", "test/test_half.py::test_red"]
+    assert tree.survives(divided, [tests]) is survives
     assert (tree.folder / "half.py").read_text() == HALF  # as before
     assert not [*tree.folder.rglob("*.pyc")]  # it could be taken for that of the next change
     assert [name for name, sound in tree.sound.items() if not sound] == (
