@@ -36,12 +36,11 @@ POSES = {"initial": (0, 0, 0), "90 deg": (1, 0, 0), "180 deg": (2, 0, 0), "shift
 
 @dataclass(frozen=True)
 class RankRow:
-    """A row of Qiao's tables 1 to 4: positions, printed rank a n^2 + b n + c, unknowns.
+    """A row of Qiao's tables 1 to 4, of so many positions: printed rank a n^2 + b n + c, unknowns.
 
     The number of unknowns is 4 n^2 + `extra`.
     """
 
-    table: int
     positions: str
     printed: tuple[float, float, float]
     extra: int
@@ -65,24 +64,24 @@ class RankRow:
 
 
 ROWS = (
-    RankRow(1, "initial", (2, 0, 7), 3),
-    RankRow(1, "90 deg", (2, 0, 7), 3),
-    RankRow(1, "180 deg", (2, 0, 7), 3),
-    RankRow(1, "shift +x", (2, -2, 7), 3),
-    RankRow(2, "initial, 90 deg", (3.5, 0, 8.5), 6),
-    RankRow(2, "initial, 180 deg", (3, 0, 9), 6),
-    RankRow(2, "initial, shift +x", (4, -2, 7), 6),
-    RankRow(3, "initial, 90 deg, 180 deg", (3.5, 0, 11.5), 9),
-    RankRow(3, "initial, 90 deg, shift +x", (4, 0, 9), 9),
-    RankRow(3, "initial, 180 deg, shift +x", (4, -1, 10), 9),
-    RankRow(3, "initial, shift +x, shift -x", (4, -2, 10), 9),
-    RankRow(3, "initial, shift +x, shift +y", (4, 0, 7), 9),
-    RankRow(4, "initial, 90 deg, 180 deg, shift +x", (4, 0, 12), 12),
-    RankRow(4, "initial, 90 deg, shift +x, shift -x", (4, 0, 12), 12),
-    RankRow(4, "initial, 90 deg, shift +x, shift +y", (4, 0, 12), 12),
-    RankRow(4, "initial, 180 deg, shift +x, shift -x", (4, -1, 13), 12),
-    RankRow(4, "initial, 180 deg, shift +x, shift +y", (4, 0, 10), 12),
-    RankRow(4, "initial, shift +x, shift -x, shift +y", (4, 0, 10), 12),
+    RankRow("initial", (2, 0, 7), 3),
+    RankRow("90 deg", (2, 0, 7), 3),
+    RankRow("180 deg", (2, 0, 7), 3),
+    RankRow("shift +x", (2, -2, 7), 3),
+    RankRow("initial, 90 deg", (3.5, 0, 8.5), 6),
+    RankRow("initial, 180 deg", (3, 0, 9), 6),
+    RankRow("initial, shift +x", (4, -2, 7), 6),
+    RankRow("initial, 90 deg, 180 deg", (3.5, 0, 11.5), 9),
+    RankRow("initial, 90 deg, shift +x", (4, 0, 9), 9),
+    RankRow("initial, 180 deg, shift +x", (4, -1, 10), 9),
+    RankRow("initial, shift +x, shift -x", (4, -2, 10), 9),
+    RankRow("initial, shift +x, shift +y", (4, 0, 7), 9),
+    RankRow("initial, 90 deg, 180 deg, shift +x", (4, 0, 12), 12),
+    RankRow("initial, 90 deg, shift +x, shift -x", (4, 0, 12), 12),
+    RankRow("initial, 90 deg, shift +x, shift +y", (4, 0, 12), 12),
+    RankRow("initial, 180 deg, shift +x, shift -x", (4, -1, 13), 12),
+    RankRow("initial, 180 deg, shift +x, shift +y", (4, 0, 10), 12),
+    RankRow("initial, shift +x, shift -x, shift +y", (4, 0, 10), 12),
 )
 PROGRAMS = (("initial", "90 deg", "shift +x"), ("initial", "180 deg", "shift +x"))
 
