@@ -274,9 +274,7 @@ class Compensator:
         emap, cubic = self.error_map, self.method == "bicubic"
         if emap.artifact.harmonics:
             return 0.0
-        ring, u = (np.concatenate([part[-3:], part, part[:3]])
-                   for part in (emap.g_theta, emap.u_g_theta))
-        return error_halfway(ring, u, cubic=cubic)[0]
+        return error_halfway(emap.g_theta, emap.u_g_theta, cubic=cubic, ring=True)[0]
 
     def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         hx, hy = self.error_map.artifact.half

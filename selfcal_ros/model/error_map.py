@@ -164,7 +164,8 @@ _SMOOTH = 1 / 4
 """Error of linear interpolation over a pitch, as a share of that over two, of a smooth function."""
 
 
-def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False) -> tuple[float, float]:
+def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False,
+                  ring: bool = False) -> tuple[float, float]:
     """Return the rms and the largest error of interpolation halfway between nodes.
 
     A node minus the value interpolated from its neighbours is the error over two pitches. Over one
@@ -178,14 +179,16 @@ def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False) -> 
         Nodes along the first axis and their standard uncertainties; NaN where unknown.
     cubic : bool
         Whether the interpolation is a cubic spline.
+    ring : bool
+        Whether the first node follows the last one, as the lines of an angular map.
     """
-    over_two, over_four = (_squares(values, u, _LINEAR, pitches) for pitches in (1, 2))
+    over_two, over_four = (_squares(values, u, _LINEAR, pitches, ring) for pitches in (1, 2))
     if not len(over_two):
         return 0.0, 0.0
     coarse = float(over_four.mean()) if len(over_four) else 0.0
     shrunk = np.clip(over_two.mean() / coarse, _SMOOTH**2, 1.0) if coarse > 0 else _SMOOTH**2
-    if cubic and len(values) > 2 * max(_CUBIC):
-        over_two, shrunk = _squares(values, u, _CUBIC, 1), shrunk**2
+    if cubic and (ring or len(values) > 2 * max(_CUBIC)):
+        over_two, shrunk = _squares(values, u, _CUBIC, 1, ring), shrunk**2
         if not len(over_two):
             return 0.0, 0.0
     mean, largest = np.sqrt(shrunk * np.maximum([over_two.mean(), over_two.max()], 0.0))
@@ -193,9 +196,12 @@ def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False) -> 
 
 
 def _squares(values: np.ndarray, u: np.ndarray, weights: dict[int, float],
-             pitches: int) -> np.ndarray:
+             pitches: int, ring: bool) -> np.ndarray:
     """Return the squared errors of known nodes predicted from neighbours, less noise, (k,)."""
-    n, reach = len(values), pitches * max(weights)
+    reach = pitches * max(weights)
+    if ring:
+        values, u = (np.pad(part, reach, mode="wrap") for part in (values, u))
+    n = len(values)
     middle = slice(reach, max(n - reach, reach))
     error, power = values[middle], u[middle] ** 2
     for distance, weight in weights.items():

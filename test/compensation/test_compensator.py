@@ -173,10 +173,9 @@ def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
     if method == "bilinear":
         assert compensator.error_theta(-np.pi / 24) == pytest.approx(
             (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16)
-        ring = [np.append(part[-3:], np.append(part, part[:3]))
-                for part in (MAP.g_theta, MAP.u_g_theta)]
         assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(np.hypot(
-            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, error_halfway(*ring)[0]))
+            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, error_halfway(
+                MAP.g_theta, MAP.u_g_theta, ring=True)[0]))
         assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(MAP.u_g_theta[23])
 
 

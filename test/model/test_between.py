@@ -93,6 +93,19 @@ def test_noise_alone_is_no_error_of_interpolation():
         assert found < 0.3 * 2e-9
 
 
+@pytest.mark.parametrize("cubic", [False, True])
+def test_each_node_of_a_ring_counts_once(cubic):
+    """Of a harmonic, cos(a) for a mean over two steps a: 1 - cos(2 a) over four, times cos."""
+    wave, a = np.sin(2 * np.pi * np.arange(8) / 8), np.pi / 4
+    left = 1 - np.cos(a) if not cubic else 1 - 9 / 8 * np.cos(a) + np.cos(3 * a) / 8
+    shrunk = ((1 - np.cos(a)) / (1 - np.cos(2 * a))) ** (2 if cubic else 1)
+    found = error_halfway(wave, 0 * wave, cubic=cubic, ring=True)
+    assert found == pytest.approx((shrunk * left / np.sqrt(2), shrunk * left))
+    for steps in range(8):
+        assert error_halfway(np.roll(wave, steps), 0 * wave, cubic=cubic, ring=True
+                             ) == pytest.approx(found)
+
+
 def test_unknown_nodes_are_left_out():
     values = np.arange(9.0) ** 2
     values[4] = np.nan

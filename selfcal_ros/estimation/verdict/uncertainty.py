@@ -348,9 +348,8 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
 def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
     if result.plate.harmonics:  # a Fourier series is known between the lines as on them
         return _interpolation("theta", 0.0, 0.0)
-    ring, u = (np.concatenate([a[-2:], a, a[:2]]) for a in (
-        result.error_map.g_theta, result.error_map.u_g_theta))
-    return _interpolation("theta", *error_halfway(ring, u))
+    emap = result.error_map
+    return _interpolation("theta", *error_halfway(emap.g_theta, emap.u_g_theta, ring=True))
 
 
 def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:

@@ -10,7 +10,9 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.verdict.uncertainty import (
+    INTERPOLATION,
     Effect,
+    budget_lines,
     difference,
     effect_of_field,
     enlarged,
@@ -125,3 +127,15 @@ def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
     assert by_name["line_eccentricity"].u_max == pytest.approx(lines.max(), rel=1e-12)
     # a strain of 2e-7 that no reading tells bends a plate of 20 mm by 4 nm
     assert 1e-9 < by_name["plate_strain"].u_rms < 1e-8
+
+
+def test_the_interpolation_of_angles_does_not_depend_on_where_the_lines_begin(result):
+    def line(steps):
+        emap = result.error_map
+        turned = replace(result, error_map=replace(
+            emap, g_theta=np.roll(emap.g_theta, steps), u_g_theta=np.roll(emap.u_g_theta, steps)))
+        return next(line for line in budget_lines(turned)
+                    if line.component == INTERPOLATION and line.quantity == "theta")
+    lines = [line(steps) for steps in range(8)]
+    assert all(one.effect_rms == pytest.approx(lines[0].effect_rms, rel=1e-12) for one in lines)
+    assert lines[0].effect_rms > 0
