@@ -329,3 +329,11 @@ def test_the_pose_of_a_plate_is_fitted_through_marks_taken_for_others():
     found, shift, left = _fitted(marks, at, False)
     assert (found, shift) == (pytest.approx(turn, abs=1e-3), pytest.approx(0.5 - 0.2j, abs=1e-3))
     assert left < 0.01
+
+
+def test_an_encoder_that_ends_early_is_not_another_clock():
+    cell = scene(count=0, repeats=3)
+    last = cell.detections[len(cell.detections) // 3].stamp_ns
+    cell.samples = [s for s in cell.samples if s.stamp_ns < last]
+    said = " ".join(findings(cell.events).values())
+    assert "no_encoder_sample_near" in said and "clock" not in said

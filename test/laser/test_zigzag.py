@@ -60,6 +60,21 @@ def test_repeats_of_a_whole_recording_become_samples():
     assert cut.data.samples_m.shape == (2, 2, 2, 6) and cut.data.counts.min() == 2
 
 
+def test_runs_that_were_repeated_more_often_than_others_keep_all_samples():
+    one, other = recording(noise_m=10e-9), recording()
+    until = 26 * 1_200_000_000  # the diagonals, without x and y
+    laser, position = other.laser_ns < until, other.position_ns < until
+    gap = int(one.laser_ns[-1]) + 10**9
+    cut = cut_zigzag(Recording(
+        np.concatenate([one.laser_ns, other.laser_ns[laser] + gap]),
+        np.concatenate([one.laser_m, other.laser_m[laser]]),
+        np.concatenate([one.position_ns, other.position_ns[position] + gap]),
+        np.concatenate([one.position_m, other.position_m[position]])), RULE)
+    assert cut.runs == {"np": 2, "pp": 2, "x": 1, "y": 1}
+    exact = cut_zigzag(recording(), RULE).data.readings_m
+    np.testing.assert_allclose(cut.data.samples_m[1], exact, atol=1e-14)
+
+
 def test_a_distance_that_shrinks_along_the_diagonal_is_turned_by_the_sign():
     series = recording()
     shrinking = replace(series, laser_m=-series.laser_m)

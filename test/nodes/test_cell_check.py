@@ -248,3 +248,11 @@ def test_bad_options_of_the_verb(tmp_path, capsys, words, said):
     plan = plan_file(tmp_path, small_plan())
     assert main(["cell", "check", "--plan", plan, *words]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("short")
+def test_the_response_of_each_axis_is_its_own(graph):
+    _, items = checked(graph, microscope_stretch=0.02)
+    x, y = (float(part.split()[1]) for part in items["signs"].figure.removeprefix(
+        "offset against stage ").split(", ")[:2])
+    assert (x, y) == (pytest.approx(-1 / 1.02, abs=3e-3), pytest.approx(-1 / 0.98, abs=3e-3))

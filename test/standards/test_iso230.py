@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import gamma
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.main import main
@@ -223,6 +224,18 @@ def test_without_repeats_the_range_of_the_mean_deviation_is_left():
     np.testing.assert_allclose(found.up_m, -2e-5 * found.position_m)
     assert np.isnan(found.s_up_m).all() and found.approaches == (0, 0)
     assert axis_figures(stage, 1, 1).figures["M"].value == 0.0
+
+
+@pytest.mark.parametrize("name", ["R+", "R-"])
+def test_the_uncertainty_of_the_repeatability_of_one_direction(name):
+    """It is 4 s, of one position with scatter; s sqrt(dof) / sigma follows chi with dof."""
+    stage, dof = linear(lambda x, y: 0 * x, lambda x, y: 0 * x), {"R+": 5, "R-": 3}
+    few = {(m, 0): Scatter(0.0, 1.0, 1e-12, 1e-12, 5, 3, 0.0) for m in range(-3, 4)}
+    few[1, 0] = Scatter(0.0, 1.0, 3e-8, 2e-8, 5, 3, 0.0)
+    found, n = axis_figures(stage, 0, 0, few).figures[name], dof[name]
+    mean = np.sqrt(2 / n) * gamma((n + 1) / 2) / gamma(n / 2)  # of chi over sqrt(dof)
+    assert found.value == pytest.approx(4 * {"R+": 3e-8, "R-": 2e-8}[name])
+    assert found.u == pytest.approx(found.value * np.sqrt(2 - 2 * mean), rel=0.1)
 
 
 @pytest.mark.parametrize(("call", "message"), [

@@ -239,6 +239,12 @@ def test_candidates_and_their_description():
     assert all(describe_view(view, tall) for view in candidate_views(tall, angular=False))
 
 
+def test_shifts_are_described_to_a_thousandth_of_a_pitch():
+    artifact = plan_of("0", 5).artifact
+    third = View("third", 0.0, (artifact.grid_pitch_m / 3, 0.0), True, False)
+    assert describe_view(third, artifact) == "an unturned view shifted by +0.333 pitch along X"
+
+
 def test_smaller_fields_keep_room_for_the_shifts():
     plan = plan_of("0, 90, tx2", 21)
     assert smaller(plan, 5).artifact.shape == (7, 7)

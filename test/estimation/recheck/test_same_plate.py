@@ -159,3 +159,9 @@ def test_a_view_off_the_lattice_that_lies_a_quarter_turn_on():
     lies = replace(turned, view=seen.view, m=-turned.n, n=turned.m)
     with pytest.raises(PlacingError, match="the plate lies turned by 127°, not by 37°"):
         recheck(replace(readings, views=(lies,)), BARE, plate)
+
+
+def test_a_negative_turn_is_named_between_0_and_360_degrees():
+    _, plate = calibrated(Sense.MICROSCOPE_MOVES)
+    with pytest.raises(PlacingError, match="turned by 0°, not by 270°"):
+        recheck(said_to_lie(once_more(Sense.MICROSCOPE_MOVES), -90), BARE, plate)

@@ -129,6 +129,15 @@ def test_unknown_sites_are_on_lines_through_known_ones():
     np.testing.assert_array_equal(_filled(field, known)[known], field[known])
 
 
+def test_an_unknown_site_lies_between_its_neighbours():
+    """Of m^2 + n^2 the mean of the neighbours on either line is larger by 1."""
+    field = (STEPS[:, None]**2 + STEPS**2).astype(complex)
+    known = np.ones((N, N), dtype=bool)
+    known[1, 1] = known[N - 2, 2] = False
+    expected = field + ~known
+    np.testing.assert_allclose(_filled(np.where(known, field, 99), known), expected, atol=1e-13)
+
+
 def test_readings_at_unknown_sites_are_left_alone():
     known = np.ones((N, N), dtype=bool)
     known[0, 0] = False
