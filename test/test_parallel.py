@@ -76,6 +76,14 @@ def test_a_worker_that_dies_costs_its_own_item():
     assert str(found[2].error) == "the process that worked on it was killed (out of memory?)"
 
 
+def test_a_worker_that_dies_early_leaves_all_other_items():
+    """More items than are handed out at once wait when it dies."""
+    jobs = [partial(os._exit, 9), *(partial(int, n) for n in range(1, 60))]
+    found = {o.index: o for o in outcomes(operator.call, jobs, workers=2)}
+    assert {i: o.value for i, o in found.items() if i} == {n: n for n in range(1, 60)}
+    assert isinstance(found[0].error, WorkerDied)
+
+
 def test_work_is_done_by_other_processes_with_one_blas_thread_each():
     jobs = [partial(__import__, "numpy"), os.getpid, os.getpid]
     pids = [o.value for o in outcomes(operator.call, jobs[1:], workers=2)]

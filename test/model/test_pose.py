@@ -17,6 +17,26 @@ from selfcal_ros.model.view import MAX_SHIFT, View
 PLATE = Artifact(11, 10e-3)
 
 
+def test_the_nearest_mark_of_a_plate_with_an_even_and_an_odd_side():
+    plate = Artifact(8, 0.01, grid_size_y=5)
+    x, y = (plate.x_m / 0.01).ravel(), (plate.y_m / 0.01).ravel()
+    for part in (-0.4, 0.4):
+        m, n = plate.nearest(x + part, y - part)
+        np.testing.assert_array_equal([m, n], [plate.m.ravel(), plate.n.ravel()])
+    tall = Artifact(5, 0.01, grid_size_y=8)
+    m, n = tall.nearest((tall.x_m / 0.01).ravel() - 0.4, (tall.y_m / 0.01).ravel() + 0.4)
+    np.testing.assert_array_equal([m, n], [tall.m.ravel(), tall.n.ravel()])
+
+
+@pytest.mark.parametrize(("degrees", "shift", "fits"), [
+    (0, 0.0, True), (0, 0.5, False), (90, 0.0, False), (90, 0.5, True), (180, 0.0, True),
+    (270, 0.5, True), (270, 1.0, False)])
+def test_a_plate_with_an_even_and_an_odd_side_fits_after_a_quarter_turn_and_half_a_pitch(
+        degrees, shift, fits):
+    view = View("v", math.radians(degrees), (shift * 0.01, shift * 0.01), True, False)
+    assert view.is_on_lattice(Artifact(8, 0.01, grid_size_y=5)) is fits
+
+
 def test_places_turn_counter_clockwise_and_shift() -> None:
     """A mark on the plate's x axis, turned by 37 deg, then shifted."""
     pose = View("a", math.radians(37), (2e-3, -1e-3)).pose

@@ -4,11 +4,14 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.papers import hu as module
 from selfcal_ros.papers.figures import hu_figures, qiao_figures
 from selfcal_ros.papers.hu import hu_text, reproduce_hu
 from selfcal_ros.papers.qiao import ROWS, SIZES, qiao_text, reproduce_qiao
+from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.reporting.figures.drawing import Discs, Path
+from selfcal_ros.simulation.machine import random_truth
 from test.support.drawings import cut_off, words_on_words
 
 
@@ -139,3 +142,13 @@ def test_qiaos_text(qiao):
     text = qiao_text(qiao)
     assert "90 of 90 ranks as printed" in text and "!" not in text
     assert "not reproducible as printed" in text and "0.0563 and 0.0572" in text
+
+
+def test_degrees_of_freedom_of_simulated_means_are_those_of_their_repeats():
+    plan = hu_plan(Artifact(5, 0.01, 8), repeats=3)
+    rng = np.random.default_rng(1)
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng)
+    for view in readings.views:
+        assert view.dof_xy == 2 * (3 - 1) * len(view.m)
+        assert view.dof_theta == (3 - 1) * len(view.k)
+    assert sum(len(view.k) for view in readings.views) >= 8

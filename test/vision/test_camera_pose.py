@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import NoDataError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.vision.camera_pose import camera_pose, tracks
 
@@ -39,3 +40,9 @@ def test_marks_are_followed_by_number():
     images = [np.array([a, b]), np.array([c, b]) + step, np.zeros((0, 2)),
               np.array([b, d, c]) + 2 * step]
     assert [found.tolist() for found in tracks(images)] == [[0, 1], [2, 1], [], [1, 3, 2]]
+
+
+def test_images_without_marks_are_counted_as_such():
+    empty = [np.zeros((0, 2))] * len(MOVES_M)
+    with pytest.raises(NoDataError, match="0 readings of 0 marks"):
+        camera_pose(MOVES_M, empty, Sense.PLATE_MOVES)

@@ -91,6 +91,14 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
         system.angular.n_readings - system.rank_angular, rel=1e-9)
 
 
+def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkeypatch):
+    _, readings = measured(missing=0.1)
+    system = residuals_of(readings, ZERO_MEAN).problem.system
+    monkeypatch.setattr(residuals, "EXACT_LINES", 0)
+    assert angular_redundancy(system).sum() == pytest.approx(
+        system.angular.n_readings - system.rank_angular, rel=1e-9)
+
+
 def test_drawn_and_exact_redundancies_agree(monkeypatch):
     _, readings = measured(missing=0.1, repeats=3)
     system = residuals_of(readings, ZERO_MEAN).problem.system

@@ -2,6 +2,7 @@
 """From which probability and which size of a field on the verdict changes its mind."""
 
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import search
-from selfcal_ros.estimation.verdict.judge import judged
+from selfcal_ros.estimation.verdict.judge import judged, provenance_of
 from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -20,6 +21,7 @@ from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
+from test.support.options import BARE
 from test.support.truth import hu_plan, simulate_measurements
 
 ARCSEC_RAD = np.pi / 648_000
@@ -158,3 +160,17 @@ def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(pixel
         assert f"{found.size:.3f} ± {found.u:.3f} to" in verdict.sentence
         assert "the scale is taken as 1 ± 0.01: correct the pixel size" in verdict.sentence
         assert verdict.grade is Grade.NOT_QUALIFIED
+
+
+def test_the_origin_is_from_the_first_exposure_to_the_last():
+    plan, rng = hu_plan(Artifact(5, 0.01), repeats=2), np.random.default_rng(2)
+    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, visits=True)
+    one = replace(readings, views=readings.views[1:2])
+    stamps = one.views[0].visits.stamp_ns
+    found = provenance_of(one, BARE)
+    span_s = (int(stamps.max()) - int(stamps.min())) * 1e-9
+    assert found.duration_s == pytest.approx(span_s) and span_s > 0
+    begin, end = (datetime.fromisoformat(found.extra[name]).timestamp()
+                  for name in ("first_exposure", "last_exposure"))
+    assert begin == pytest.approx(int(stamps.min()) * 1e-9, abs=1e-3)
+    assert end - begin == pytest.approx(span_s, abs=2e-3)
