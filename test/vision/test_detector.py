@@ -8,7 +8,7 @@ from selfcal_ros.collection.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.vision.detector import MarkDetector, offset
-from selfcal_ros.vision.finding import candidates
+from selfcal_ros.vision.finding import _noise, candidates
 from selfcal_ros.vision.images import Picture
 
 PIXEL = 2e-6
@@ -206,3 +206,10 @@ def test_nine_marks_are_found_row_by_row():
 def test_impossible_sizes_are_refused(wrong, problem):
     with pytest.raises(InputError, match=problem):
         detector(**wrong)
+
+
+def test_the_noise_of_a_picture_is_found_beside_a_slope_and_a_mark():
+    rng, (x, y) = np.random.default_rng(4), np.mgrid[:120, :150]
+    picture = rng.normal(0, 3.0, x.shape) + 0.4 * x - 0.2 * y
+    picture[50:60, 40:50] += 200
+    assert _noise(picture) == pytest.approx(3.0, rel=0.05)
