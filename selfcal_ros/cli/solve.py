@@ -21,7 +21,7 @@ from selfcal_ros.cli.terminal import (
     put,
     show,
 )
-from selfcal_ros.collection.inputs import advice
+from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import (
@@ -159,7 +159,9 @@ def run(args: argparse.Namespace) -> int:
         measurements, _, lost, findings = collect_bag(
             args.bag, collector, namespace=args.namespace,
             progress=lambda count: bar(count, None))
-    said = [*findings, *lost, *(() if findings else advice(measurements.all_rejected()))]
+    used = sum(view.used for view in measurements.views)
+    said = [*findings, *lost, *(
+        () if findings else rejections(measurements.all_rejected(), used))]
     for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     measurements = _with_map(args, measurements)

@@ -234,7 +234,7 @@ class Collector:
 
         `measurements` and `progress` are the last result of `collect`.
         """
-        if self._seen is None or not measurements.all_rejected().keys() & inputs.REMEDY.keys():
+        if self._seen is None:
             return {}
         return self._seen.findings({index: view.readings for index, view in progress.items()},
                                    measurements.rejected)

@@ -90,7 +90,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class RejectionFinding:
-    """A reason for which most detections were rejected: counts, cause and remedy."""
+    """A reason for which many detections were rejected, or none as yet: counts, cause, remedy."""
 
     reason: str
     count: int
@@ -99,6 +99,8 @@ class RejectionFinding:
 
     def __str__(self) -> str:
         """Return it as one line."""
+        if not self.count:
+            return self.text
         return (f"{self.count} of {self.total} detections were rejected as {self.reason}: "
                 f"{self.text}")
 

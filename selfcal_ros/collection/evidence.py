@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detections of a session with the stage at their exposures, as evidence of what is wrong."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from selfcal_ros.collection.diagnosis import (
+    AT_LEAST,
     PLACED,
     Evidence,
     RejectionFinding,
@@ -14,8 +16,9 @@ from selfcal_ros.collection.diagnosis import (
     diagnose,
     wrong_joints,
 )
+from selfcal_ros.collection.expected import mark_rows
 from selfcal_ros.collection.exposures import Exposures
-from selfcal_ros.collection.inputs import Kind
+from selfcal_ros.collection.inputs import REMEDY, Kind, Reason
 from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.marks.seen_poses import (
     NamedMarks,
@@ -26,9 +29,12 @@ from selfcal_ros.collection.marks.seen_poses import (
 from selfcal_ros.collection.marks.stops import places_of_cells
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
+from selfcal_ros.model.view import View
 
 FAR_M = 1e9
 """Distance beyond which a number is no place, whatever its unit."""
+A_ROW = 0.25
+"""Detections of a row of the plate, as a part of those of the row with most of them."""
 LOOKED_AT = 2000
 """Number of the last detections of a view whose stage positions are examined."""
 
@@ -102,6 +108,8 @@ class DetectionsSeen:
                  ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
+        Ids of a plate of another size are named for the session, however few were rejected.
+
         Parameters
         ----------
         views : dict
@@ -114,6 +122,9 @@ class DetectionsSeen:
             for reason, count in readings.rejected.items():
                 rejected[reason] = rejected.get(reason, 0) + count
         used = sum(readings.used for readings in views.values())
+        size = self._other_size(views, rejected, used)
+        if size is not None:
+            return {None: size}
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         seen = seen_poses(marks, limit, self.rules.max_rotation_rad)
@@ -131,6 +142,38 @@ class DetectionsSeen:
                 finding.reason in PLACED and joints and wrong_joints(whole))):
             return named
         return {None: finding}
+
+    def _other_size(self, views: Mapping[int, ViewReadings], rejected: Mapping[str, int],
+                    used: int) -> RejectionFinding | None:
+        """Return that the ids are those of a plate with more or fewer rows; None if not."""
+        unknown = rejected.get(Reason.UNKNOWN_MARK, 0)
+        plate, outside = self.artifact, unknown >= AT_LEAST
+        asked = _asked(plate, [view.view for view in views.values() if view.view.grid])
+        parts = [part for view in views.values() for part in view.parts]
+        unread = [whole.difference(*(np.unique(getattr(part, axis)).tolist() for part in parts))
+                  for axis, whole in zip("mn", asked, strict=True)]
+        if plate.marks is not None or not (outside or any(unread)):
+            return None
+        here = (self.table["kind"] == Kind.GRID) & self.table["has_id"] & (self.view_of >= 0)
+        view_of = self.view_of[here]
+        found = [_rows(self.table[axis][here], view_of, limits)
+                 for axis, limits in zip("mn", plate.limits, strict=True)]
+        if len(np.unique(view_of)) < 2:  # rows that are missing may follow
+            found = [rows | whole for rows, whole in zip(found, asked, strict=True)]
+        if not all(found) or any(max(rows) - min(rows) + 1 != len(rows) for rows in found):
+            return None
+        sides, planned = (tuple(map(len, rows)) for rows in (found, asked))
+        on_plate = all(low <= min(rows) and max(rows) <= high
+                       for rows, (low, high) in zip(found, plate.limits, strict=True))
+        if sides == planned or outside is on_plate:
+            return None
+        (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in found), plate.shape)
+        exchanged = " (the sides are exchanged)" if sides == (ny, nx) else ""
+        total = used + sum(count for reason, count in rejected.items() if reason in REMEDY)
+        return RejectionFinding(
+            Reason.UNKNOWN_MARK, unknown, total,
+            f"the ids are those of {sides[0]} x {sides[1]} marks (m {m}, n {n}), not of "
+            f"{nx} x {ny}{exchanged}; correct grid_size in the plan, or the ids")
 
     def _evidence(self, rejected: Mapping[str, int], used: int, marks: Mapping[int, NamedMarks], *,
                   joints: bool, lies: str, view: int | None = None) -> Evidence:
@@ -169,6 +212,31 @@ class DetectionsSeen:
                 sign * where[good] / pitch, _complex(cells) / pitch,
                 _complex(offset - cells) / pitch, listed=self.artifact.marks is not None)
         return found
+
+
+def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[int]:
+    """Return the ids that are rows: on the plate in any view, beyond it in most of the views.
+
+    A row has many detections; few are mistakes.
+    """
+    views: Counter[int] = Counter()
+    numbers = np.unique(view_of)
+    for view in numbers:
+        values, counts = np.unique(ids[view_of == view], return_counts=True)
+        views.update(values[counts > A_ROW * counts.max()].tolist())
+    return {row for row, count in views.items()
+            if limits[0] <= row <= limits[1] or count > len(numbers) / 2}
+
+
+def _asked(artifact: Artifact, views: Iterable[View]) -> tuple[set[int], set[int]]:
+    """Return the m, and the n, of the marks that views ask for."""
+    m, n = set(), set()
+    for view in views:
+        first, count = mark_rows(artifact, view)
+        some = count > 0
+        m |= set((np.flatnonzero(some) - artifact.middle[0]).tolist())
+        n |= set(range(first[some].min(), (first + count)[some].max()) if some.any() else ())
+    return m, n
 
 
 def _complex(values: np.ndarray) -> np.ndarray:

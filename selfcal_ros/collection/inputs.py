@@ -322,6 +322,24 @@ REMEDY = {
 """Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 
 
+MANY = 0.1
+"""Part of the detections above which the reason of most rejections is stated with a result."""
+HARMLESS = (Reason.OUTSIDE_VIEWS, Reason.MOVING, Reason.NOT_IN_VIEW)
+"""Reasons that are normal where a detector publishes all the time."""
+
+
+def rejections(rejected: Mapping[str, int], used: int) -> list[str]:
+    """Return what to say of the rejections of a session whose cause is not known."""
+    bad = {reason: count for reason, count in rejected.items()
+           if reason in REMEDY and reason not in HARMLESS}
+    total = used + sum(bad.values())
+    reason = max(bad, key=lambda name: bad[name], default="")
+    if reason in ADVICE or sum(bad.values()) <= MANY * total:
+        return advice(rejected)
+    return [f"{sum(bad.values())} of {total} detections were rejected, {bad[reason]} of them as "
+            f"{reason}: {REMEDY[Reason(reason)]}", *advice(rejected)]
+
+
 def advice(rejected: Mapping[str, int]) -> list[str]:
     """Return one line for each reason in `rejected` with advice, with its count."""
     return [f"{count} detection{'s' * (count != 1)} rejected as {reason}: {text}"

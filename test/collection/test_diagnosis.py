@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
-from selfcal_ros.collection.inputs import REMEDY, Reason
+from selfcal_ros.collection.inputs import REMEDY, Reason, rejections
 from selfcal_ros.collection.marks.seen_poses import NamedMarks, _fitted
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import START_NS, gathered, scene
-from test.support.plans import placed_plan
+from test.support.plans import placed_plan, plan_of
 from test.support.truth import random_truth
 
 S = 1_000_000_000
@@ -337,3 +337,44 @@ def test_an_encoder_that_ends_early_is_not_another_clock():
     cell.samples = [s for s in cell.samples if s.stamp_ns < last]
     said = " ".join(findings(cell.events).values())
     assert "no_encoder_sample_near" in said and "clock" not in said
+
+
+def declared(cell, *size):
+    """Return the messages with another number of marks in the plan, e.g. 8 or 8, 5."""
+    commands = [c if c.artifact is None else replace(
+        c, artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]))
+        for c in cell.commands]
+    return [*commands, *cell.samples, *cell.detections]
+
+
+@pytest.mark.parametrize(("plate", "size", "said"), [
+    ((7,), (5,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr"),
+    ((7,), (9,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr"),
+    ((6,), (7,), "the ids are those of 6 x 6 marks (m -3 to 2, n -3 to 2), not of 7 x 7; corr"),
+    ((7, 5), (5, 7), "those of 7 x 5 marks (m -3 to 3, n -2 to 2), not of 5 x 7 (the sides are "
+                     "exchanged); correct grid_size in the plan")])
+def test_a_plate_of_another_size_is_named_by_its_ids(plate, size, said):
+    plan = plan_of("0, 180, tx, ty", plate[0], size_y=(*plate, 0)[1])
+    events = declared(scene(plan), *size)
+    (found,) = findings(events).values()
+    assert said in found
+
+
+@pytest.mark.parametrize("text", ["0, 90", "0, 90, 180, tx, ty", "tx, tx2"])
+def test_a_plate_of_the_declared_size_is_not_suspected(text):
+    """Not either if single ids are misread, or a view is still being measured."""
+    cell = scene(plan_of(text, 7, repeats=2))
+    for index in range(0, len(cell.detections), 9):
+        cell.spoil(index, m=cell.detections[index].m + 9)
+    for part in (len(cell.detections), len(cell.detections) // 3):
+        events = [*cell.commands, *cell.samples, *cell.detections[:part]]
+        assert not any("the ids are those" in found for found in findings(events).values())
+
+
+def test_the_cause_of_many_rejections_is_stated_with_a_result():
+    assert rejections({"unknown_mark": 10, "duplicate": 500, "stage_moving": 99}, 90) == []
+    assert rejections({"low_score": 4, "unknown_mark": 8}, 90) == [
+        f"12 of 102 detections were rejected, 8 of them as unknown_mark: "
+        f"{REMEDY[Reason.UNKNOWN_MARK]}"]
+    (line,) = rejections({"from_the_future": 50}, 50)
+    assert line.startswith("50 detections rejected as from_the_future")
