@@ -14,7 +14,7 @@ nodes of the map are apart. Of images, the marks on the optical axis are compare
 were named.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -76,6 +76,24 @@ class Misplaced:
         return cls(view, planned.turn_deg, found.turn_deg, planned.shift, found.shift, gain)
 
 
+@dataclass(frozen=True)
+class Mirrored:
+    """A frame of stage and offsets that is left-handed: plates turn the other way in it.
+
+    `axes` are the reflections that explain the readings about equally well, keys of `MIRRORS`.
+    """
+
+    axes: tuple[str, ...]
+    gain: float
+
+
+MIRRORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "x reversed": lambda z: -z.conj(), "y reversed": np.conj,
+    "x and y exchanged": lambda z: 1j * z.conj(),
+    "x and y exchanged and reversed": lambda z: -1j * z.conj()}
+"""Reflection of a frame -> places and deviations in the right one."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """Readings of one view in the window: places, complex (n,), pitches, deviations, m, repeats."""
@@ -97,8 +115,12 @@ def check_placing(measurements: Measurements) -> None:
         raise said(found, f"plan '{measurements.plan_id}', ")
 
 
-def misplaced(measurements: Measurements) -> Misplaced | None:
-    """Return the view in which the plate is placed differently, if the readings show one."""
+def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
+    """Return the view in which the plate is placed differently, if the readings show one.
+
+    Or that the frame is mirrored, if that explains all views clearly better than another pose of
+    one of them.
+    """
     artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
     told = [(view.view, seen) for view in measurements.views
             if view.view.cell in (None, (0, 0)) and (seen := _seen(artifact, view)) is not None]
@@ -123,14 +145,32 @@ def misplaced(measurements: Measurements) -> Misplaced | None:
             likelihood, left = _likelihood(views, *sizes)
             tried.append((likelihood - planned, left, view, seen.pose, pose))
         views[index] = seen
+    tried.sort(key=lambda item: -item[0])
+    best = max(tried[0][0] if tried else 0.0, 0.0)
+    enough = max(CONTRADICTED, LEFT * square)
+    if mirrored := _mirrored(views, planned, sizes, max(best + CLEARLY, BETTER), enough):
+        return mirrored
     if not tried:
         return None
-    tried.sort(key=lambda item: -item[0])
     gain, left, view, before, pose = tried[0]
     second = tried[1][0] if len(tried) > 1 else 0.0
-    if gain < BETTER or gain - second < CLEARLY or left > max(CONTRADICTED, LEFT * square):
+    if gain < BETTER or gain - second < CLEARLY or left > enough:
         return None
     return Misplaced.of(view.plan_view, before, pose, gain)
+
+
+def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, float], least: float,
+              enough: float) -> Mirrored | None:
+    """Return the reflections that gain the most, if that is more than `least`."""
+    gains = {}
+    for name, of in MIRRORS.items():
+        likelihood, left = _likelihood([replace(
+            seen, place=of(seen.place), deviation=of(seen.deviation)) for seen in views], *sizes)
+        if likelihood - planned > least and left < enough:
+            gains[name] = likelihood - planned
+    best = max(gains.values(), default=0.0)
+    axes = tuple(name for name, gain in gains.items() if gain > best - CLEARLY)
+    return Mirrored(axes, best) if axes else None
 
 
 def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
@@ -260,8 +300,13 @@ def _likelihood(views: list[_Seen], noise: float, spread: float,
     return float(likelihood), float(square / 2 / (len(site) - free.shape[1]))
 
 
-def said(found: Misplaced, where: str = "") -> PlacingError:
+def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:
     """Return in one line how the plate is placed, and how to continue."""
+    if isinstance(found, Mirrored):
+        return PlacingError(f"{where}all views", "the plate turns and shifts as in a mirrored "
+                            f"frame: stage and offsets have {', or '.join(found.axes)}",
+                            "correct the axes of both, so that a plate turned counter-clockwise "
+                            "turns from +x to +y")
     if found.found_deg != found.planned_deg:
         what = f"the plate lies turned by {found.found_deg:g}°, not by {found.planned_deg:g}°"
         wrong_way = (found.found_deg + found.planned_deg) % 360 == 0

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError, misplaced, other_poses
 from selfcal_ros.model.artifact import Artifact
@@ -158,3 +159,38 @@ def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
 def test_plates_off_the_lattice_that_lie_as_planned_are_no_finding(name, sigma):
     for seed in range(5):
         assert misplaced(laid_at(PLATES[name], 1, SIX[1], seed, sigma)) is None
+
+
+def reflected(events, of):
+    """Return the messages of a cell whose joints and offsets are of(x, y)."""
+    out = []
+    for event in events:
+        if isinstance(event, EncoderSample):
+            x, y, *theta = event.positions
+            event = replace(event, positions=(*of(x, y), *theta), velocities=())
+        elif isinstance(event, Detection):
+            x, y = of(event.offset_x, event.offset_y)
+            event = replace(event, offset_x=x, offset_y=y)
+        out.append(event)
+    return out
+
+
+@pytest.mark.parametrize("sense", list(Sense))
+@pytest.mark.parametrize(("of", "said"), [
+    (lambda x, y: (-x, y), "have x reversed; correct"),
+    (lambda x, y: (x, -y), "have y reversed; correct"),
+    (lambda x, y: (y, x), "have x and y exchanged; correct"),
+    (lambda x, y: (-y, -x), "have x and y exchanged and reversed; correct")])
+def test_a_mirrored_frame_without_ids_is_named(sense, of, said):
+    cell = scene("0, 90, 180, tx, ty", with_ids=False, sense=sense, **NOISE)
+    readings = collect(reflected(cell.events, of), measurement_sense=str(sense))[0]
+    with pytest.raises(PlacingError, match=f"all views: the plate turns .* {said}"):
+        calibrate(readings)
+    assert misplaced(collect(cell.events, measurement_sense=str(sense))[0]) is None
+
+
+def test_one_view_turned_the_other_way_is_not_taken_for_a_mirrored_frame():
+    """Two views tell the sense of a turn: the rest of the plan agrees with the frame."""
+    cell, names = laid("0, 90, 180, tx, ty", "0, 270, 180, tx, ty", with_ids=False)
+    found = misplaced(collect(cell.events)[0])
+    assert (found.view, found.found_deg) == (names[1], 270)
