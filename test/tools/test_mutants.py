@@ -173,7 +173,8 @@ import tools.watched as watched
 here = Path(sys.argv[1])
 watched.ROOT, watched.PACKAGE, watched.KEPT = here, f"{here}/package/", here / "kept"
 sys.path.insert(0, str(here))
-sys.exit(pytest.main(["-q", "-p", "no:cacheprovider", str(here)], plugins=[watched.Watch()]))
+options = ["-q", "-p", "no:cacheprovider", f"--rootdir={here}"]
+sys.exit(pytest.main([*options, str(here)], plugins=[watched.Watch()]))
 """
 PACKAGE = """
 def double(x):
