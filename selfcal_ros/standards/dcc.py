@@ -14,6 +14,7 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import COMBINED, CalibrationResult
+from selfcal_ros.model.terms import TermName
 from selfcal_ros.reporting.chapters import convention_section, said
 from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
@@ -23,6 +24,8 @@ from selfcal_ros.standards.statements import (
     TRACEABILITY,
     distance_text,
     is_traceable,
+    known_plate_texts,
+    method_name,
     require_certifiable,
     statement_texts,
 )
@@ -185,8 +188,8 @@ def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> E
     return _dcc(
         "measurementResults",
         _dcc("usedMethods", _dcc(
-            "usedMethod", _content("name", "Self-calibration of a stage with a plate in several "
-                                   "views"), _content("description", *_model_texts(result)),
+            "usedMethod", _content("name", method_name(result)),
+            _content("description", *known_plate_texts(result), *_model_texts(result)),
             _dcc("norm", "JCGM 100:2008"))),
         _dcc("usedSoftware", _software()),
         _dcc("measuringEquipments", *equipment) if equipment else None,
@@ -206,6 +209,8 @@ def _model_texts(result: CalibrationResult) -> list[str]:
     texts = [f"{result.model.misalignment} misalignments of the plate in each view; method: "
              f"{result.method}, {result.sense.replace('_', ' ')}"]
     for term in result.model.terms:
+        if term.name == TermName.LINE_ECCENTRICITY and not result.plate.angular_count:
+            continue
         size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
         texts.append(f"term {term.name}: {size}, {term.source}")
     return texts

@@ -7,6 +7,7 @@ from typing import Any
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import PRIOR, CalibrationResult
 from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.units import UM_PER_M
@@ -64,6 +65,29 @@ def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]
     yield "Scope", [SCOPE]
 
 
+def method_name(result: CalibrationResult) -> str:
+    """Return the name of the method."""
+    if RECHECK in result.extra:
+        return "Comparison of a stage with a plate known from its calibration"
+    return "Self-calibration of a stage with a plate in several views"
+
+
+def known_plate_texts(result: CalibrationResult) -> list[str]:
+    """Return which calibration made the plate of a recheck known; nothing of other results."""
+    found = result.extra.get(RECHECK, {}).get("calibration")
+    if not found:
+        return []
+    readings, dates = found["readings"], [
+        found[name][:10] for name in ("first_exposure", "last_exposure") if name in found]
+    facts = [f"plan {found['plan_id']}", *([f"run {found['run_id']}"] if found["run_id"] else []),
+             *([f"readings of {' to '.join(dict.fromkeys(dates))}"] if dates else []),
+             *([f"{readings['file']}, sha256 {readings['sha256']}"]
+               if {"file", "sha256"} <= readings.keys() else []),
+             *([f"evaluated {found['created']}"] if found["created"] else [])]
+    return [f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
+            "uncertainty is the line 'known plate' of the budget"]
+
+
 def scale_texts(result: CalibrationResult) -> list[str]:
     """Return what sets the scale of a map, and whether it is traceable."""
     reference = result.reference
@@ -71,6 +95,10 @@ def scale_texts(result: CalibrationResult) -> list[str]:
         return ["The scale of the map is a convention, relative to the encoders: no reference "
                 "length was used. Form, straightness and squareness do not depend on a reference."]
     texts = []
+    if RECHECK in result.extra:
+        texts.append("The scale is that of the known plate, set at its calibration as follows. The "
+                     "expansion of the plate since then is not corrected: the temperature of this "
+                     "measurement is among the influence conditions.")
     for found in reference.get("runs", [reference]):
         texts.append(f"The scale is set by a reference length ({reference_name(found)}): relative "
                      f"error {found['relative_error']:.4g}, standard uncertainty "

@@ -51,7 +51,7 @@ def test_a_stage_that_is_as_it_was(folder, capsys):
     assert found["largest"]["u"] > 0 and data["verdict"]["qualified"] is True
     assert data["warnings"] == []
     assert main(["diff", str(folder / "r.json"), str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["significance_xy"]["correlated"] is False
+    assert json.loads(capsys.readouterr().out)["significance_xy"]["correlated"] is True
 
 
 def test_the_calibrations_own_recording_is_refused(folder, capsys):

@@ -20,6 +20,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import PRIOR, result_from_dict, result_to_dict
@@ -30,6 +32,7 @@ from selfcal_ros.standards.chapter import certificate_chapter
 from selfcal_ros.standards.dcc import DCC, SI, certificate
 from selfcal_ros.standards.details import details_from_dict, read_details
 from selfcal_ros.standards.statements import is_traceable
+from test.support.lattice_plans import plan_of
 from test.support.maps import random_map, result_of
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 
@@ -480,3 +483,48 @@ def test_the_report_has_the_same_for_people(tmp_path, capsys):
     chapter = certificate_chapter(replace(apart, views=()), details())
     assert any("correlations between nodes are not known" in note
                for section in chapter.sections for note in section.notes)
+
+
+def rechecked():
+    """Return a calibration with a certified length, and what one view of its plate gave."""
+    plan, rng = plan_of("0,90,tx", Artifact(5, 0.01)), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    before = worded(calibrate(
+        simulate_measurements(truth, plan, rng, sigma_m=2e-8),
+        Options(reference=CERTIFIED.at_temperature("21:.1:5e-7:5e-8"), causes=False)))
+    before = replace(before, input={"file": "plate.mcap", "sha256": "0123abcd"})
+    view = replace(plan, plan_id="again", views=plan.views[:1])
+    readings = simulate_measurements(truth, view, rng, sigma_m=2e-8)
+    plate = known_plate(result_from_dict(result_to_dict(before), "r"), "there/r.json")
+    return before, worded(recheck(readings, Options(), plate))
+
+
+def test_the_certificate_of_a_recheck_states_its_method_and_the_calibration_behind_it():
+    before, after = rechecked()
+    first, root = written(before), written(after, covariance=True)
+    [method] = root.iter(f"{{{DCC}}}usedMethod")
+    text = " ".join(method.itertext())
+    assert "Comparison of a stage with a plate known from its calibration" in text
+    assert "plan 0,90,tx; plate.mcap, sha256 0123abcd" in text
+    assert "Self-calibration of a stage" in " ".join(first.itertext())
+    assert not named(first, "Comparison of a stage with a plate known from its calibration")
+    scale = " ".join(statement(root, "Metrological traceability").itertext())
+    assert "The scale is that of the known plate" in scale and "used at 21 °C" in scale
+    assert "known plate" not in " ".join(statement(first, "Metrological traceability").itertext())
+    for one in (first, root):
+        assert "line_eccentricity" not in " ".join(one.itertext())  # there are no lines
+    assert "line_eccentricity" in " ".join(written().itertext())
+
+
+def test_the_certificate_of_a_recheck_has_u_of_squareness_and_correlations():
+    _, after = rechecked()
+    root, k = written(after, covariance=True), after.noise.k_xy
+    u_o, u_r = first_order_u(after)
+    for name, u in (("non-orthogonality O, Gx = O y + R x, Gy = O x - R y", u_o),
+                    ("scale difference R", u_r)):
+        [item] = named(root, name)
+        assert float(item.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(k * u)
+    cover, _ = xy_covariance(after, after.error_map.valid)
+    u = np.concatenate([after.error_map.u_gx.ravel(), after.error_map.u_gy.ravel()])
+    np.testing.assert_allclose(np.sqrt(np.diag(cover)), u, rtol=1e-6)
+    assert u_o > 0 and [*named(root, "a"), *named(root, "Gx, then Gy")]

@@ -11,7 +11,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.between import RUNS_LEVEL, Deviation, Mean, Run, mean_of
 from selfcal_ros.estimation.comparison.covariance import (
-    COVARIANCE,
+    kept_covariance,
     theta_covariance,
     xy_covariance,
 )
@@ -24,7 +24,7 @@ from selfcal_ros.estimation.comparison.runs import (
     shared_reference,
 )
 from selfcal_ros.estimation.joint.problem import coverage_factor
-from selfcal_ros.estimation.joint.solved import KEY, factors_of, rounded
+from selfcal_ros.estimation.joint.solved import KEY, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.verdict.uncertainty import (
@@ -59,8 +59,6 @@ DEGREE = 3
 """Degree up to which each polynomial of a map may vary between runs by its own."""
 HARMONICS = 3
 """The same of the angular map, waves per turn."""
-MAX_STORED = 2 * 21 * 21
-"""Largest number of coordinates whose covariance is stored: 3.5 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +156,17 @@ def _require_single_run(part: Part, others: Sequence[Part]) -> None:
         if other.origin is not None and _same_recording(result, other.origin):
             raise InputError(part.name, f"of the same recording as {other.name}",
                              "leave one of them out")
+        if other.origin is not None and (plate := _readings_of_plate(result)) and (
+                plate == _readings_of_plate(other.origin)):
+            raise InputError(part.name, f"of the same plate errors as {other.name}: both rest on "
+                             "one calibration", "leave one of them out")
+
+
+def _readings_of_plate(result: CalibrationResult) -> str:
+    """Return the SHA-256 of the readings that made the plate of a map known; empty if unknown."""
+    recheck = result.extra.get("recheck")
+    of = result.input if recheck is None else recheck.get("calibration", {}).get("readings", {})
+    return str(of.get("sha256", ""))
 
 
 def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
@@ -288,18 +297,14 @@ def _extra(parts: Sequence[Part], xy: tuple[np.ndarray, Mean],
         "weight": float(mean.weights[index]), **_of_run(mean.deviations[index], "", limit),
         **({} if angular is None else _of_run(angular.deviations[index], "_theta", limit))}
         for index, part in enumerate(parts)]
-    stored = {}
+    covers = {}
     for name, found in (("xy", mean), ("theta", angular)):
         whole = found is not None and (name == "theta" or all(
             part.result is not None for part in parts))
-        if found is not None and whole and found.covariance.ndim == 2 \
-                and len(found.values) <= MAX_STORED and all(
-                    test.test is None or test.test.correlated for test in found.deviations):
-            lower = np.tril_indices(len(found.values))
-            stored[name] = rounded(found.covariance[lower] / (scale := float(
-                np.diag(found.covariance).mean()))).tolist()
-            stored[f"scale_{name}"] = scale
-    return {COMBINED: facts, **({COVARIANCE: stored} if stored else {})}
+        if found is not None and whole and found.covariance.ndim == 2 and all(
+                test.test is None or test.test.correlated for test in found.deviations):
+            covers[name] = found.covariance
+    return {COMBINED: facts, **kept_covariance(covers)}
 
 
 def _of_run(found: Deviation, kind: str, limit: float) -> dict[str, Any]:

@@ -6,6 +6,7 @@ variances of the map are known.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import IMAGES, ImageNoise, stops_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
-from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of, rounded
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
@@ -31,9 +32,12 @@ from selfcal_ros.model.view import View, shared_rotations
 
 MAX_LINES = 1024
 """Largest number of lines for a full covariance matrix."""
+MAX_STORED = 2 * 21 * 21
+"""Largest number of coordinates whose covariance is stored: 3.5 MB."""
 COVARIANCE = "map_covariance"
-"""Key of the covariance of a mean map: lower triangles over Gx, then Gy, of the known sites (`xy`),
-and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta` (rad^2)."""
+"""Key of the covariance of a mean map, or of a recheck: lower triangles over Gx, then Gy, of the
+known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta`
+(rad^2)."""
 
 
 def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -103,6 +107,23 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
     return _sized(cover[np.ix_(known, known)], u), True
 
 
+def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return covariances of the known values as a result keeps them, those that are not too large.
+
+    Parameters
+    ----------
+    covers : dict
+        ``xy``, Gx, then Gy, m^2, and ``theta``, rad^2 -> covariance (n, n).
+    """
+    stored: dict[str, Any] = {}
+    for kind, cover in covers.items():
+        if 0 < len(cover) <= MAX_STORED:
+            scale = float(np.diag(cover).mean())
+            stored[kind] = rounded(cover[np.tril_indices(len(cover))] / scale).tolist()
+            stored[f"scale_{kind}"] = scale
+    return {COVARIANCE: stored} if stored else {}
+
+
 def _stored(stored: dict[str, Any], kind: str, valid: np.ndarray,
             known: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the stored covariance of the known values, which are among the valid ones."""
@@ -134,7 +155,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
-    if PRIOR in result.extra or result.method in ("law", COMBINED):
+    if {PRIOR, COVARIANCE} & result.extra.keys() or result.method in ("law", COMBINED):
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
         cover, whole = xy_covariance(result, known)
         if not whole:

@@ -183,6 +183,16 @@ class NewMap:
         return {"reading noise": of_noise, "known plate": np.maximum(of_plate, 0.0),
                 "terms": np.maximum(whole - of_noise, 0.0)}
 
+    def covariance(self, plate: KnownPlate) -> np.ndarray:
+        """Return the covariance of the map at the known nodes, Gx, then Gy, m^2, as `variances`."""
+        nowhere, rows = np.zeros(plate.kept.sites.shape, dtype=bool), self.gain.rows
+        if plate.result.reference is None:
+            rows = self.without_scale(rows)
+        rows = rows[np.tile(self.known.ravel(), 2)]
+        moved = rows @ self.plate
+        return rows @ self.gain.noise @ rows.T + moved @ plate.kept.cover(
+            nowhere, self.marks) @ moved.T
+
     def without_scale(self, values: np.ndarray) -> np.ndarray:
         """Return maps (2 n, ...) without motion and magnification over the known nodes."""
         here, out = np.tile(self.known.ravel(), 2), np.zeros(values.shape)
@@ -353,8 +363,11 @@ def line_change(new: NewLines, plate: KnownPlate) -> Change:
     return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
-def record(change: Change, lines: Change, artifact: Artifact, of: str) -> dict[str, Any]:
+def record(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate) -> dict[str, Any]:
     """Return what a result says of a recheck: `recheck` in RESULT.json, SI units."""
+    before = plate.result
+    dates = {name: text for name in ("first_exposure", "last_exposure")
+             if (text := before.provenance.extra.get(name))}
     i, j, k = change.worst
     parts = [part for part in (change, lines) if part.test is not None]
     p = min(len(parts) * min(part.p for part in parts), 1.0) if parts else float("nan")
@@ -362,7 +375,10 @@ def record(change: Change, lines: Change, artifact: Artifact, of: str) -> dict[s
     largest = {"x": float(artifact.x_m[at]), "y": float(artifact.y_m[at]), "axis": "xy"[i],
                "change": float(change.values[i, j, k]), "u": float(change.u[i, j, k])}
     found: dict[str, Any] = {
-        "of": of, "changed": bool(p < DIFFERENCE_LEVEL), "p": p, "largest": largest,
+        "of": plate.where, "calibration": {
+            "plan_id": before.plan_id, "run_id": before.run_id, "created":
+            before.provenance.created, "readings": dict(before.input), **dates},
+        "changed": bool(p < DIFFERENCE_LEVEL), "p": p, "largest": largest,
         "rms": rms(change.values), "u_rms": rms(change.u), "p_xy": change.p,
         "significance_xy": None if change.test is None else asdict(change.test),
         "scale": {"changed": bool(change.p_scale < DIFFERENCE_LEVEL), "change": change.scale,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.comparison.covariance import dof_of_marks, share_of
+from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.angular import Conditions
 from selfcal_ros.estimation.joint.images import stops_of
@@ -142,9 +142,13 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
-    readings, seen, parts = solved.readings, solved.seen, solved.new.variances(plate)
-    found = record(map_change(solved.new, plate), line_change(solved.lines, plate),
-                   solved.new.artifact, plate.where)
+    readings, seen, new, lines = solved.readings, solved.seen, solved.new, solved.lines
+    known = np.tile(new.known.ravel(), 2)
+    parts = {name: variance[known] for name, variance in new.variances(plate).items()}
+    of_lines = np.isfinite(lines.values)
+    covers = {"xy": new.covariance(plate),
+              "theta": lines.covariance(plate)[np.ix_(of_lines, of_lines)]}
+    found = record(map_change(new, plate), line_change(lines, plate), new.artifact, plate)
     noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
@@ -163,7 +167,8 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         views_of(measurements, problem, of_views), Observability(unknowns, unknowns, 0, True),
         noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
-        sense=str(measurements.sense), extra={KEY: found}, run_id=measurements.run_id,
+        sense=str(measurements.sense), extra={KEY: found, **kept_covariance(covers)},
+        run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=before.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),

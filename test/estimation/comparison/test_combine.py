@@ -406,3 +406,18 @@ def test_the_probability_of_a_run_is_twice_that_of_its_worse_test(p, p_z, both):
     assert found == {"e_n_rms_theta": pytest.approx(np.sqrt(4.75 / 4)), "e_n_largest_theta": 2.0,
                      "beyond_theta": 0.25, "p_theta": both, "agrees_theta": both == 1.0,
                      "stands_out_theta": True}
+
+
+def test_a_recheck_is_not_combined_with_what_its_plate_is_known_from():
+    one, other = (part(f"{name}.json", replace(result, input={"sha256": name}))
+                  for result, name in ((A, "a"), (B, "b")))
+    assert combine([one, other])
+
+    def rechecked(run, of):
+        return replace(run, result=replace(run.result, extra={
+            **run.result.extra, "recheck": {"calibration": {"readings": {"sha256": of}}}}))
+    assert combine([one, rechecked(other, "c")])
+    for pair in ([one, rechecked(other, "a")], [rechecked(other, "a"), one],
+                 [rechecked(one, "c"), rechecked(other, "c")]):
+        with pytest.raises(InputError, match=r"of the same plate errors as .*one calibration"):
+            combine(pair)

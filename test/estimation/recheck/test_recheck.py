@@ -12,6 +12,11 @@ from scipy.stats import chi2, f
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import (
+    first_order_u,
+    theta_covariance,
+    xy_covariance,
+)
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.change import known_plate
@@ -85,7 +90,7 @@ def sessions(sense=Sense.MICROSCOPE_MOVES, pose=(0, 0, 0), microscope=False):
 
 
 def require_first_order(emap):
-    """Require O and R of a map as a fit of its known nodes has them."""
+    """Require O and R of a map as a fit of its known nodes has them; return them as (2, 2 n)."""
     known = emap.valid
     x, y = (part[known] for part in (emap.artifact.x_m, emap.artifact.y_m))
     one, none = np.ones_like(x), np.zeros_like(x)
@@ -94,6 +99,7 @@ def require_first_order(emap):
     fitted = np.linalg.lstsq(np.hstack([along_x, along_y]).T, values, rcond=None)[0]
     assert [emap.nonorthogonality, emap.scale_difference] == pytest.approx(fitted[4:], rel=1e-6)
     assert np.abs(fitted[4:]).min() > 1e-9
+    return np.linalg.pinv(np.hstack([along_x, along_y]).T)[4:]
 
 
 def require_same(result, wanted, *, rel=1e-5):
@@ -116,7 +122,14 @@ def require_same(result, wanted, *, rel=1e-5):
             of, spread = wanted.of(rows)
             assert u == pytest.approx(spread, rel=rel)
             assert np.abs(value - of).max() < rel * spread.min()
-    require_first_order(emap)
+    shear = require_first_order(emap)
+    assert first_order_u(result) == pytest.approx(wanted.of(shear @ wanted.after)[1], rel=rel)
+    cover, whole = xy_covariance(result, emap.valid)
+    assert whole and cover == pytest.approx(wanted.after @ wanted.after.T, abs=rel * cover.max())
+    if wanted.K:
+        cover, whole = theta_covariance(result, np.isfinite(emap.g_theta))
+        assert whole and cover == pytest.approx(wanted.after_theta @ wanted.after_theta.T,
+                                                abs=rel * cover.max())
     u = np.linalg.norm(wanted.scale)
     assert found["scale"]["change"] == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
     assert found["scale"]["u"] == pytest.approx(u, rel=rel)
@@ -290,6 +303,20 @@ def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
     size = np.linalg.norm(left, axis=1).reshape(2, -1).max(axis=0)
     assert size[valid].max() < 1e-7
     assert (size > 1e-3).sum() >= free and 12 <= valid.sum() <= 24 - free
+
+
+def test_the_budget_is_of_the_known_nodes_alone():
+    """Nodes that the readings do not determine have variances, without a meaning."""
+    before, after = general((4, (0.1, -0.1)), how="bicubic")
+    after = replace(after, views=(subset(after.views[0], after.views[0].m <= 5,
+                                         np.zeros(0, bool)),))
+    found = recheck(after, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+    emap, lines = found.error_map, [line for line in found.budget if line.effect_max]
+    u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
+    assert np.count_nonzero(~emap.valid) > 0 and len(lines) >= 2
+    assert np.sqrt(sum(line.effect_rms**2 for line in lines)) == pytest.approx(
+        np.sqrt(np.mean(u**2)))
+    assert all(line.effect_rms <= line.effect_max <= u.max() for line in lines)
 
 
 def test_a_map_with_as_many_nodes_as_marks_needs_more_than_one_view():
