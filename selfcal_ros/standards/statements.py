@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a certificate states of a result, for programs and for people, and what it cannot."""
 
+import math
 from collections.abc import Iterator
 from datetime import date, timedelta
 from typing import Any
@@ -27,8 +28,9 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
     Raises
     ------
     InputError
-        If the result has no uncertainties, a prior is part of it, or the readings are not of the
-        days of the certificate. A day either way is a time zone.
+        If the result has no uncertainties, a prior is part of it, the temperature of the plate is
+        not that with which its length was converted, or the readings are not of the days of the
+        certificate. A day either way is a time zone.
     """
     if not result.has_uncertainty:
         raise InputError("certificate", "the result has no uncertainties",
@@ -36,6 +38,7 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
     if PRIOR in result.extra:
         raise InputError("certificate", "a prior is part of the map: its uncertainty is not that "
                          "of readings alone", "solve without a prior")
+    _require_temperature(result, details["conditions"])
     core, zone = details["certificate"], timedelta(days=1)
     times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]
     if all(times) and "clock" not in core:
@@ -45,6 +48,26 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
             raise InputError("certificate", f"the readings are of {first} to {last}, the dates of "
                              f"performance {begin} to {end}", "correct begin and end, or explain "
                              "the clock of the readings in certificate.clock")
+
+
+def _require_temperature(result: CalibrationResult, conditions: list[dict[str, Any]]) -> None:
+    """Refuse a temperature of the plate that contradicts the one of its reference length.
+
+    It may differ in a recheck, whose reference length is that of the plate's calibration, and
+    between the runs of a mean.
+    """
+    reference = result.reference or {}
+    known = reference.get("certified")
+    if not known or "runs" in reference or RECHECK in result.extra or reference["kind"].startswith("stage"):
+        return
+    used, u = known["temperature_c"], known["u_temperature_k"]
+    for item in conditions:
+        if item.get("unit") == "degC" and "plate" in item["name"] and (
+                abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9):
+            raise InputError(
+                "certificate", f"{item['name']} is {item['value']:g} °C, but the reference length "
+                f"was converted to {used:g} °C (u {u:g} K)", "correct the condition, or solve "
+                "again with the temperature of the measurement in --reference-at")
 
 
 def is_traceable(result: CalibrationResult) -> bool:

@@ -181,7 +181,8 @@ def test_the_certificate_is_valid(lines):
     schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
     for result, options in ((solved(lines=lines), {"covariance": True}),
                             (replace(RESULT, views=()), {}), (BAD, {"not_qualified": True}),
-                            (solved(CERTIFIED.at_temperature("21:.1:5e-7:5e-8"), lines=lines), {})):
+                            (solved(CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"), lines=lines),
+                             {})):
         schema.assertValid(etree.fromstring(certificate(result, details(), **options)))
 
 
@@ -191,18 +192,18 @@ def statement(root, name):
 
 
 def test_only_a_certified_reference_at_its_temperature_is_traceable():
-    full = CERTIFIED.at_temperature("21:.1:5e-7:5e-8")
+    full = CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8")
     for reference, traceable in ((None, False), (CERTIFIED, False), (full, True),
                                  (replace(full, certificate=""), False),
                                  (replace(full, u_relative=0.0), False), (OF_MARKS, False),
-                                 (OF_MARKS.at_temperature("21:.1:5e-7:5e-8"), True)):
+                                 (OF_MARKS.at_temperature("20.4:.1:5e-7:5e-8"), True)):
         result = solved(reference)
         assert is_traceable(result) is traceable
         said = statement(written(result), "Metrological traceability")
         assert said.findtext("dcc:traceable", "", IN) == str(traceable).lower()
         text = " ".join(said.itertext())
         assert ("PTB 1" in text) is bool(reference and reference.certificate)
-        assert ("used at 21 °C" in text) is bool(reference and reference.certified)
+        assert ("used at 20.4 °C" in text) is bool(reference and reference.certified)
         assert ("Not traceable" in text) is bool(reference and not traceable)
         assert ("(distance of the marks (-2, 0) and (2, 0))" in text) is bool(
             reference and reference.marks)
@@ -308,6 +309,23 @@ def test_readings_of_other_days_are_refused(first, last, good):
     assert "3 years behind" in " ".join(said.itertext())
 
 
+@pytest.mark.parametrize(("reference", "name", "value", "good"), [
+    (CERTIFIED, "temperature of the plate", 20.55, True),  # 2 u of both: 0.22 K
+    (CERTIFIED, "temperature of the plate", 20.7, False),
+    (CERTIFIED, "temperature of the air", 23.0, True),
+    (replace(CERTIFIED, kind="stage_x"), "temperature of the plate", 20.7, True)])
+def test_a_plate_at_another_temperature_than_its_length_is_refused(reference, name, value, good):
+    result = solved(reference.at_temperature("20.4:.1:5e-7:5e-8"))
+    given = {**details(), "conditions": [{"name": name, "value": value, "u": 0.05, "unit": "degC"}]}
+    if good:
+        assert certificate(result, given)
+        return
+    for write in (certificate, certificate_chapter):
+        with pytest.raises(InputError, match=r"is 20\.7 °C, but the reference length was converted "
+                           r"to 20\.4 °C \(u 0\.1 K\); correct the condition, or solve again"):
+            write(result, given)
+
+
 def test_a_date_of_issue_that_is_missing_is_today_and_not_before_the_end():
     given = without("certificate", "issued")
     assert details_from_dict(given, "d")["certificate"]["issued"] == date.today().isoformat()
@@ -358,19 +376,19 @@ def run(seed, reference=None):
 
 
 def test_a_mean_is_traceable_if_all_its_runs_are():
-    warm, cold = (CERTIFIED.at_temperature(f"{t}:.1:5e-7:5e-8") for t in (21, 20.5))
-    for references, traceable in (((warm, cold), True), ((warm, warm), True),
-                                  ((warm, CERTIFIED), False)):
+    cold, warm = (CERTIFIED.at_temperature(f"{t}:.1:5e-7:5e-8") for t in (20.4, 21))
+    for references, traceable in (((cold, warm), True), ((cold, cold), True),
+                                  ((cold, CERTIFIED), False)):
         parts = [run(seed, reference) for seed, reference in zip((5, 6), references, strict=True)]
         mean = worded(combine(parts, keep_scale=True).result)
         assert is_traceable(mean) is traceable
         root = written(mean)
         text = " ".join(statement(root, "Metrological traceability").itertext())
-        assert ("used at 20.5 °C" in text) is (cold in references) and "used at 21 °C" in text
+        assert ("used at 21 °C" in text) is (warm in references) and "used at 20.4 °C" in text
         assert [named(root, f"readings of {part.name}") != [] for part in parts] == [True, True]
         assert is_traceable(result_from_dict(result_to_dict(mean), "m")) is traceable
     table = Part("t.csv", run(7).error_map)
-    assert not is_traceable(combine([run(5, warm), table], keep_scale=True).result)
+    assert not is_traceable(combine([run(5, cold), table], keep_scale=True).result)
 
 
 def test_a_mean_has_u_of_its_squareness():
@@ -467,11 +485,11 @@ def test_the_verb_writes_refuses_and_ends_with_the_code_of_the_result(tmp_path, 
 
 def test_the_report_has_the_same_for_people(tmp_path, capsys):
     result, page = str(tmp_path / "r.json"), tmp_path / "r.html"
-    write_json(result, result_to_dict(solved(CERTIFIED.at_temperature("21:.1:5e-7:5e-8"))))
+    write_json(result, result_to_dict(solved(CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"))))
     assert main(["report", result, "--details", str(DETAILS), "-o", str(page)]) == 0
     text = page.read_text()
     for part in ("EX-2026-0042", "Example Calibration Laboratory", "temperature of the plate",
-                 "20.4", "used at 21 °C", "U of the distance L", "chromium on fused silica"):
+                 "20.4", "used at 20.4 °C", "U of the distance L", "chromium on fused silica"):
         assert part in text, part
     assert main(["report", result, "-o", str(page)]) == 0
     assert "EX-2026-0042" not in page.read_text()
@@ -491,7 +509,7 @@ def rechecked():
     truth = random_truth(plan.artifact, len(plan.views), rng)
     before = worded(calibrate(
         simulate_measurements(truth, plan, rng, sigma_m=2e-8),
-        Options(reference=CERTIFIED.at_temperature("21:.1:5e-7:5e-8"), causes=False)))
+        Options(reference=CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"), causes=False)))
     before = replace(before, input={"file": "plate.mcap", "sha256": "0123abcd"})
     view = replace(plan, plan_id="again", views=plan.views[:1])
     readings = simulate_measurements(truth, view, rng, sigma_m=2e-8)
@@ -509,7 +527,7 @@ def test_the_certificate_of_a_recheck_states_its_method_and_the_calibration_behi
     assert "Self-calibration of a stage" in " ".join(first.itertext())
     assert not named(first, "Comparison of a stage with a plate known from its calibration")
     scale = " ".join(statement(root, "Metrological traceability").itertext())
-    assert "The scale is that of the known plate" in scale and "used at 21 °C" in scale
+    assert "The scale is that of the known plate" in scale and "used at 20.4 °C" in scale
     assert "known plate" not in " ".join(statement(first, "Metrological traceability").itertext())
     for one in (first, root):
         assert "line_eccentricity" not in " ".join(one.itertext())  # there are no lines
