@@ -4,7 +4,10 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,26 +38,30 @@ from selfcal_ros.units import NS_PER_S
 COLUMNS = ("file", "view", "x", "y")
 """Columns of a table of positions: image file, name of the view, indicated position, m. Without a
 plan the view is not needed."""
+TIME = "time"
+"""Column for the times of the exposures, if they are known: ISO 8601 with its zone."""
 FARTHEST_M = 10.0
 FAR = 30
 """Median distance of positions, over that of the plate's edge, which shows another unit than m."""
-START_NS = 1_700_000_000 * NS_PER_S
-"""Stamp of the first command: the times of the exposures are not known."""
-STEP_NS = NS_PER_S
-"""Time between two stamps of such a bag."""
+START_NS = 1_000 * NS_PER_S
+"""Stamp of the first command if the times of the exposures are not known: no date."""
+STEP_NS = NS_PER_S  # between two stamps of such a bag
+BEFORE_NS = {Phase.PLACE: 40_000_000, Phase.MEASURE: 30_000_000}
+"""Times of the commands before the first exposure of a view."""
 BESIDE_NS = (-20_000_000, -10_000_000, 10_000_000, 20_000_000)
 """Stamps of encoder samples relative to an exposure: the stage rests."""
 
 
 @dataclass(frozen=True)
 class Position:
-    """A row of the table: place for messages, image file, index of the view, position in m."""
+    """A row: place for messages, image file, index of the view, position in m, time if known."""
 
     where: str
     file: str
     view: int
     x_m: float
     y_m: float
+    stamp_ns: int | None = None
 
 
 def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
@@ -64,7 +71,8 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     ------
     InputError
         For another heading, a view that the plan does not have, a file that comes twice, a
-        position that is none, or positions far from the plate of the plan.
+        position that is none, positions far from the plate of the plan, or times that do not
+        increase.
     NoDataError
         If there are no rows.
     """
@@ -72,7 +80,8 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     lines = [(f"{path}:{number}", line) for number, line in enumerate(
         text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     heading = csv_cells(lines[0][1], lines[0][0]) if lines else []
-    columns = COLUMNS if plan else [column for column in COLUMNS if column != "view"]
+    columns = [column for column in COLUMNS if plan or column != "view"]
+    columns += [TIME] if TIME in heading else []
     for column in columns:
         if column not in heading:
             raise InputError(str(path), f"no column '{column}'",
@@ -94,10 +103,26 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
                              f"{first[cells['file']].rpartition(':')[2]} as well",
                              "give each image once; a repeated mark is another image")
         rows.append(Position(where, cells["file"], names.index(view),
-                             _metres(cells["x"], where), _metres(cells["y"], where)))
+                             _metres(cells["x"], where), _metres(cells["y"], where),
+                             _stamp_ns(cells[TIME], where) if TIME in heading else None))
     if plan:
         _check_unit(str(path), rows, plan)
-    return sorted(rows, key=lambda row: row.view)
+    rows.sort(key=lambda row: row.view)
+    for before, row in pairwise(rows):
+        if row.stamp_ns is not None and row.stamp_ns - (before.stamp_ns or 0) < STEP_NS / 10:
+            raise InputError(row.where, f"not exposed 0.1 s or more after {before.file}",
+                             "give the times in the order of the exposures, and the views of the "
+                             "plan in the order in which they were measured; or omit the column")
+    return rows
+
+
+def _stamp_ns(text: str, where: str) -> int:
+    """Return a time as ns since 1970."""
+    with suppress(ValueError):
+        if (date := datetime.fromisoformat(text)).tzinfo is not None:
+            return (date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+    raise InputError(where, f"'{text}' is no time with its zone",
+                     "write it as 2026-11-21T09:30:00.25+01:00")
 
 
 def _check_unit(path: str, rows: list[Position], plan: Plan) -> None:
@@ -148,13 +173,15 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
     problems: Counter[str] = Counter()
     latched = qos_profile(reliable=True, transient_local=True, depth=64)
     volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
-    now, view = START_NS, -1
+    rows, view = list(rows), -1
+    now = rows[0].stamp_ns - STEP_NS if rows and rows[0].stamp_ns is not None else START_NS
+    run_id = str(now)
 
     def command(phase: Phase, index: int) -> None:
         known = plan.views[index] if index < len(plan.views) else None
         writer.write(f"/{COMMAND_TOPIC}", from_model.command(Command(
             now, phase, plan.plan_id, index, known, plan.artifact if known else None,
-            len(plan.views), run_id=str(START_NS), model_terms=plan.model_terms), frame_id), now)
+            len(plan.views), run_id=run_id, model_terms=plan.model_terms), frame_id), now)
 
     with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
         for topic, typename in INPUT_TOPICS.items():
@@ -163,9 +190,10 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
         for row in rows:
             if row.view != view:
                 view = row.view
-                for phase in (Phase.PLACE, Phase.MEASURE):
+                for phase, before_ns in BEFORE_NS.items():
+                    now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns - before_ns
                     command(phase, view)
-                    now += STEP_NS
+            now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns
             for step in BESIDE_NS:
                 sample = EncoderSample(now + step, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0))
                 writer.write(f"/{ENCODER_TOPIC}", from_model.joint_state(sample, frame_id),
@@ -177,7 +205,7 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
                 found = ()
             for detection in found:
                 writer.write(f"/{DETECTION_TOPIC}", from_model.detection(detection, frame_id), now)
-            now += STEP_NS
+        now += STEP_NS
         command(Phase.DONE, len(plan.views))
     return problems
 

@@ -249,6 +249,27 @@ def test_a_folder_of_files_gives_the_detections_of_the_bag(bag, tmp_path):
         assert (np.abs(away) < 5 * np.array(result["error_map"][f"u_{axis}"], float)).all()
 
 
+def test_the_times_of_files_are_those_of_the_table_and_unknown_without(tmp_path):
+    folder = pictures(tmp_path)
+    heading, *rows = (folder / "positions.csv").read_text().splitlines()
+    (tmp_path / "timed.csv").write_text("\n".join([f"{heading},time", *(
+        f"{row},2026-11-21T10:{10 + number // 60}:{number % 60:02}.5+01:00"
+        for number, row in enumerate(rows))]))
+    found = {}
+    for name, table in (("timed", tmp_path / "timed.csv"), ("plain", folder / "positions.csv")):
+        assert detect(folder, tmp_path / name, "--positions", str(table),
+                      "--plan", str(tmp_path / "plan.yaml")) == 0
+        assert main(["solve", str(tmp_path / name), "-o", str(tmp_path / "R.json")]) in (0, 5)
+        found[name] = read_json(tmp_path / "R.json")
+    made = found["timed"]["provenance"]
+    assert made["first_exposure"] == "2026-11-21T09:10:00.500+00:00"
+    assert made["last_exposure"] == "2026-11-21T09:12:19.500+00:00"
+    assert made["duration_s"] == 139
+    made = found["plain"]["provenance"]
+    assert "first_exposure" not in made and made["duration_s"] is None
+    assert found["timed"]["error_map"]["gx"] == found["plain"]["error_map"]["gx"]
+
+
 def own_values(data):
     kind = "selfcal_msgs/msg/MarkDetection"
     message = store_with(kind).deserialize_cdr(data, kind)
@@ -263,6 +284,12 @@ def own_values(data):
     ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell"),
     ("\ufefffile,view,x,y\r\na.png,,0,0\r\n", ":2: an empty cell"),
     ("file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n", ":4: a.png is in line 2 as well"),
+    ("file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:00\n",
+     ":2: '2026-11-21T09:30:00' is no time with its zone; write it as 2026-11-21T09:30:00.25+01:0"),
+    ("file,view,x,y,time\na.png,shift,0,0,\n", ":2: an empty cell; give file, view, x, y, time"),
+    ("file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:01Z\n"
+     "b.png,shift,0,0,2026-11-21T10:30:01.05+01:00\n",
+     ":3: not exposed 0.1 s or more after a.png; give the times in the order of the exposures"),
     ("file,view,x,y\na.png,shift,9,9\nb.png,shift,0,-1.2\nc.png,shift,0,0\n", "p.csv: half of "
      "the positions are over 1.2 m from the origin, the marks of the plan within 0.0383 m; give x "
      "and y in m")])

@@ -251,11 +251,16 @@ def _repeats_findings(measurements: Measurements) -> list[Finding]:
             if lost > max(FEW_OUTLIERS, MANY_OUTLIERS * total)]
 
 
+FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
+"""Stamp below which stamps are no dates, 1971."""
+
+
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     """Return the origin of the readings: first and last exposure, visiting order.
 
     `model_terms_from` says who requested terms: ``options`` or ``plan``. The time of creation is
-    left empty, so that the same readings give the same result.
+    left empty, so that the same readings give the same result. Stamps of 1970 are no dates: those
+    of a simulated clock, or of images whose times are not known.
     """
     stamps = [stamp for view in measurements.views
               if view.visits is not None and len(view.visits.stamp_ns)
@@ -266,7 +271,7 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     if options.terms_from:
         extra["model_terms_from"] = options.terms_from
     duration = float("nan")
-    if stamps:
+    if stamps and min(stamps) >= FIRST_DATE_NS:
         extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
         duration = (max(stamps) - min(stamps)) / NS_PER_S
     return Provenance("", duration, __version__, extra)
