@@ -50,6 +50,14 @@ class Screen:
         self.process.stdin.write(f"{word}\n")
         self.process.stdin.flush()
 
+    def until_all(self, *texts: str) -> list[str]:
+        """Return the next lines that hold the texts, which come in any order."""
+        begin = len(self.lines)
+        for text in texts:
+            if not any(text in line for line in self.lines[begin:]):
+                self.until(text)
+        return [next(line for line in self.lines[begin:] if text in line) for text in texts]
+
     def until(self, text: str) -> str:
         """Return the next line that holds `text`."""
         deadline = time.monotonic() + PATIENCE_S
@@ -111,9 +119,9 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
             os.kill(pid_of(up.process.pid, "solver"), signal.SIGKILL)
             up.until("solver ended with signal 9: restarted")
         up.write("confirm")
-    up.until("now: Done. s starts another run.")
-    up.until("map: Calibrated from 4 views: largest error ")
-    saved = Path(up.until("saved: ").removeprefix("saved: "))
+    *_, line = up.until_all("now: Done. s starts another run.",
+                            "map: Calibrated from 4 views: largest error ", "saved: ")
+    saved = Path(line.removeprefix("saved: "))
     assert saved.parent == tmp_path
     assert re.fullmatch(r"plan_simulated_\d{19}\.json", saved.name)
     assert read_json(saved)["verdict"]["qualified"]
