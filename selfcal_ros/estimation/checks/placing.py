@@ -9,7 +9,8 @@ estimated from the readings, the readings of all views have a normal likelihood 
 the plate: the errors of the marks, which they carry from view to view, show the right one. Each
 view has a free offset, rotation, strain and bending, which are not mistaken for another pose. The
 stage's errors are independent from site to site; at any pose they are a field as smooth as the
-nodes of the map are apart. Of images, the marks on the optical axis are compared. Of
+nodes of the map are apart. Of images in three views or more the marks on the optical axis are
+compared, of fewer views those of all cells, each as of a view of its own. Of
 1,000 clean simulated measurements on the lattice none was refused, and 200 wrongly placed plates
 were named.
 """
@@ -122,8 +123,11 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     one of them.
     """
     artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
-    told = [(view.view, seen) for view in measurements.views
-            if view.view.cell in (None, (0, 0)) and (seen := _seen(artifact, view)) is not None]
+    every = [(view.view, seen) for view in measurements.views
+             if (seen := _seen(artifact, view)) is not None]
+    told = [(view, seen) for view, seen in every if view.cell in (None, (0, 0))]
+    if len(told) < 3:
+        told = every
     views = [seen for _, seen in told]
     if len(views) < 3:
         return None
@@ -139,12 +143,16 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if square < EXPLAINED:
         return None
     tried = []
-    for index, (view, seen) in enumerate(told):
+    names = list(dict.fromkeys(view.plan_view for view, _ in told))
+    for view, seen in told:
+        if view.cell not in (None, (0, 0)) or (
+                len(names) == 2 and view.plan_view == names[0]):  # their relative pose alone counts
+            continue
         for pose in _poses(seen, artifact):
-            views[index] = replace(seen, pose=pose)
-            likelihood, left = _likelihood(views, *sizes)
+            moved = [_moved(other, seen.pose, pose) if also.plan_view == view.plan_view else other
+                     for also, other in told]
+            likelihood, left = _likelihood(moved, *sizes)
             tried.append((likelihood - planned, left, view, seen.pose, pose))
-        views[index] = seen
     tried.sort(key=lambda item: -item[0])
     best = max(tried[0][0] if tried else 0.0, 0.0)
     enough = max(CONTRADICTED, LEFT * square)
@@ -171,6 +179,14 @@ def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, flo
     best = max(gains.values(), default=0.0)
     axes = tuple(name for name, gain in gains.items() if gain > best - CLEARLY)
     return Mirrored(axes, best) if axes else None
+
+
+def _moved(seen: _Seen, planned: Any, pose: Any) -> _Seen:
+    """Return the readings of a cell of images at the pose of their view; the camera stays."""
+    if seen.pose == planned:
+        return replace(seen, pose=pose)
+    (a, b), (x, y), (u, v) = seen.pose.shift, planned.shift, pose.shift
+    return replace(seen, pose=replace(pose, shift=(a + u - x, b + v - y)))
 
 
 def other_poses(pose: LatticePose) -> Iterator[LatticePose]:

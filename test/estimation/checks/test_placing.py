@@ -67,14 +67,17 @@ def unrepeated(readings):
         replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views))
 
 
+@pytest.mark.parametrize("others", [(180,), ()])
 @pytest.mark.parametrize("repeats", [1, 2])
 @pytest.mark.parametrize("sense", list(Sense))
-def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats):
+def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats, others):
+    """Of two views the second relative to the first."""
     truth = random_truth(Artifact(7, 1e-3, 0), 3, np.random.default_rng(3))
     planned, lies = (simulate_measurements(
-        truth, image_plan(7, turns=(0, turn, 180), repeats=repeats), np.random.default_rng(4),
+        truth, image_plan(7, turns=(0, turn, *others), repeats=repeats), np.random.default_rng(4),
         sigma_m=2e-8, sense=sense) for turn in (90, 270))
-    assert len(lies.views) == 27 and misplaced(planned) is None and misplaced(lies) is None
+    assert len(lies.views) == 9 * (2 + len(others))
+    assert misplaced(planned) is None and misplaced(lies) is None
     views = tuple(replace(there, view=here.view, m=-there.m, n=-there.n)
                   if there.view.plan_view == "270" else there
                   for here, there in zip(planned.views, lies.views, strict=True))
