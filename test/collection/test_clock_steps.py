@@ -176,3 +176,13 @@ def test_a_clock_that_runs_away_slowly_hides_no_later_step():
     stamps = true - (true - true[0]) // 2000
     stamps[19_000:] += 200 * MS
     assert [round(step.by_ns / MS, -1) for step in found(stamps, true)] == [200]
+
+
+def test_a_quick_stream_that_overlaps_a_slow_one_is_no_step():
+    """Both clocks seem to go back by 10 s, less than a few messages of the slow stream take."""
+    slow = TRUE[0] + np.arange(300) * S
+    both = np.concatenate([slow, slow[-1] - 10 * S + np.arange(300) * 5 * MS])
+    assert found(both, both) == []
+    (step,) = found(np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]),
+                    np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]))
+    assert abs(step.by_ns + 11.5 * S) < 60 * MS

@@ -347,6 +347,17 @@ def declared(cell, *size):
     return [*commands, *cell.samples, *cell.detections]
 
 
+def test_an_encoder_that_stands_still_in_the_middle_of_a_small_plate():
+    """It never was farther than a pitch along either axis from where it stopped."""
+    cell = scene(count=0, repeats=4, size=3)
+    stop = cell.detections[13]  # of the second pass over nine marks, the fifth
+    place = next(s.positions for s in cell.samples if s.stamp_ns > stop.stamp_ns)
+    assert (stop.m, stop.n) == (0, 0)
+    cell.samples = [s if s.stamp_ns < stop.stamp_ns else replace(s, positions=place, velocities=())
+                    for s in cell.samples]
+    assert "the stage has stopped: it is indicated at" in findings(cell.events)[None]
+
+
 @pytest.mark.parametrize(("plate", "size", "said"), [
     ((7,), (5,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr"),
     ((7,), (9,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr"),

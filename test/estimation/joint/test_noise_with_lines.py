@@ -13,10 +13,11 @@ from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.truth import hu_plan, simulate_measurements
 
 NOISE = 10e-9
+PLATE = Artifact(6, 0.01, 24, 4)
 
 
-def calibrated(seed):
-    plan, rng = hu_plan(Artifact(6, 0.01, 24, 4), repeats=2), np.random.default_rng(seed)
+def calibrated(seed, artifact=PLATE, repeats=2):
+    plan, rng = hu_plan(artifact, repeats), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, 4, rng, Spread(
         rotation="finite", phi_rad=1e-3, t_m=2e-5, microscope_rotation_rad=0.01))
     settings = CellSettings(sigma_xy_m=NOISE, sigma_theta_rad=2e-6, servo_sigma_m=3e-7)
@@ -32,3 +33,11 @@ def test_residuals_of_few_marks_show_their_own_noise_and_not_that_of_lines():
     found = np.array([noise.sigma_xy_residuals for noise in noises]) ** 2 / NOISE**2
     assert abs(dof @ found / dof.sum() - 1) < 4 * np.sqrt(2 / dof.sum())
     assert abs(np.mean(dof * (found - 1) ** 2) / 2 - 1) < 0.8  # as scattered as they say
+
+
+def test_the_noise_of_very_few_marks_is_that_of_lines_as_well():
+    """Marks alone would have 4 to 7 degrees of freedom."""
+    for lines in (8, 12, 24):
+        result = calibrated(1, Artifact(3, 0.01, lines), 1)
+        assert result.noise.dof_xy_residuals > 10 and result.verdict.grade is Grade.GOOD
+        assert 0.5 < result.noise.sigma_xy_residuals / NOISE < 2
