@@ -15,10 +15,6 @@ ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
               "recheck", "quality", "api")
 """The parts of estimation/: each imports only those before it."""
 
-MODULES_OF_A_FOLDER = 12
-ONE_MODULE_EACH = {"cli": "one module per verb", "nodes": "one module per node"}
-"""Folders that may hold more modules, and why."""
-
 
 def dotted(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
@@ -90,14 +86,6 @@ def test_the_parts_of_estimation_import_only_those_before_them(module):
     for other in graph()[module]:
         if other.startswith("selfcal_ros.estimation."):
             assert ESTIMATION.index(part_of(other)) <= place, f"{module} -> {other}"
-
-
-@pytest.mark.parametrize("folder", sorted({path.parent for path in SOURCES}),
-                         ids=lambda p: str(p.relative_to(ROOT)))
-def test_a_folder_holds_few_modules(folder):
-    modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
-    if folder.name not in ONE_MODULE_EACH:
-        assert len(modules) <= MODULES_OF_A_FOLDER, f"{len(modules)} modules: make sub-packages"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=dotted)

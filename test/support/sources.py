@@ -15,14 +15,12 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 class Source:
     """What the rules look at; the syntax tree itself would fill the memory.
 
-    `imports` are those at the top, `late` those anywhere else, `functions` a triple for each
-    function: line, name, and lines of its body.
+    `imports` are those at the top, `late` those anywhere else.
     """
 
     text: str
     imports: tuple[ast.Import | ast.ImportFrom, ...]
     late: tuple[ast.Import | ast.ImportFrom, ...]
-    functions: tuple[tuple[int, str, int], ...]
 
 
 @cache
@@ -34,6 +32,4 @@ def source(path: Path) -> Source:
     imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return Source(
         text, tuple(node for node in imports if node in tree.body),
-        tuple(node for node in imports if node not in tree.body),
-        tuple((node.lineno, node.name, node.end_lineno - node.body[0].lineno) for node in nodes
-              if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)))
+        tuple(node for node in imports if node not in tree.body))
