@@ -247,7 +247,8 @@ def error_map(message: Any) -> ErrorMap:
     Raises
     ------
     InputError
-        If an array does not have one value per site or line, or the datum is unknown.
+        If an array does not have one value per site or line, an error that is stated as known is
+        not finite, no error is known, or the datum is unknown.
     """
     artifact = artifact_of(message)
     sites, lines = math.prod(artifact.shape), artifact.angular_count
@@ -261,14 +262,31 @@ def error_map(message: Any) -> ErrorMap:
                          f"use one of {', '.join(ThetaDatum)}")
     grids = {name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
              for name in ("gx", "gy", "u_gx", "u_gy")}
-    unknown = ~np.array(message.valid, dtype=bool).reshape(artifact.shape)
+    known = np.array(message.valid, dtype=bool).reshape(artifact.shape)
+    g_theta, u_g_theta = (np.array(getattr(message, name), dtype=float)
+                          for name in ("g_theta", "u_g_theta"))
+    _refuse_not_finite(grids, known, g_theta)
     for values in grids.values():
-        values[unknown] = np.nan
-    return ErrorMap(artifact, **grids, g_theta=np.array(message.g_theta, dtype=float),
-                    u_g_theta=np.array(message.u_g_theta, dtype=float),
+        values[~known] = np.nan
+    return ErrorMap(artifact, **grids, g_theta=g_theta, u_g_theta=u_g_theta,
                     nonorthogonality=float(message.nonorthogonality),
                     scale_difference=float(message.scale_difference),
                     datum_theta=ThetaDatum(message.datum_theta))
+
+
+def _refuse_not_finite(grids: dict[str, np.ndarray], known: np.ndarray,
+                       g_theta: np.ndarray) -> None:
+    """Refuse a map that is not finite where it is said to be known, or known nowhere."""
+    for name in ("gx", "gy"):
+        bad = int((~np.isfinite(grids[name][known])).sum())
+        if bad:
+            raise InputError(ERROR_MAP_TOPIC, f"{name} is not finite at {bad} of the "
+                             f"{int(known.sum())} valid sites", "correct the publisher")
+    if np.isinf(g_theta).any():
+        raise InputError(ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher")
+    if not known.any() or (len(g_theta) and np.isnan(g_theta).all()):
+        raise InputError(ERROR_MAP_TOPIC, "the error of no site or of no line is known",
+                         "measure, or correct the publisher")
 
 
 @dataclass(frozen=True)

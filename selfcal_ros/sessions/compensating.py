@@ -87,8 +87,12 @@ class CompensatingSession:
         self._waits = waits
         if not waits:
             message, self._map = self._map, None
-            self._use(to_model.error_map(message), _source(message),
-                      to_model.stamp_ns(message), str(getattr(message, "interpolation", "")))
+            try:
+                self._use(to_model.error_map(message), _source(message),
+                          to_model.stamp_ns(message), str(getattr(message, "interpolation", "")))
+            except InputError as error:
+                self._waits = str(error)
+                raise
 
     def _doubt(self) -> str:
         """Return why the newest map must not be used, or ""."""
@@ -110,6 +114,7 @@ class CompensatingSession:
 
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
+        self._refuse_large(error_map, source)
         method, fitted = self._settings.interpolation, None
         if stated in get_args(Interpolation):
             fitted = cast(Interpolation, stated)
@@ -118,6 +123,20 @@ class CompensatingSession:
                                        outside=self._settings.outside)
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
+
+    def _refuse_large(self, error_map: ErrorMap, source: str) -> None:
+        """Refuse a map that moves a position by more than `max_correction`.
+
+        The angular map moves the farthest site by its angle times the radius.
+        """
+        artifact, limit_m = error_map.artifact, self._settings.max_correction
+        radius_m = math.hypot(*artifact.half) * artifact.grid_pitch_m
+        largest_m = max(np.abs(part[~np.isnan(part)]).max(initial=0.0) for part in (
+            error_map.gx, error_map.gy, error_map.g_theta * radius_m))
+        if largest_m > limit_m:
+            raise InputError(f"the map of {source}", f"it corrects by up to {largest_m:.3g} m, "
+                             f"max_correction is {limit_m:.3g} m",
+                             "check its units (m, rad), or set max_correction")
 
     def receive(self, data: bytes, received_ns: int) -> None:
         """Take a sensor_msgs/JointState as received; it waits for `correct_waiting`."""
@@ -172,8 +191,8 @@ class CompensatingSession:
     def command(self, data: bytes) -> bytes | None:
         """Return a commanded sensor_msgs/JointState with x, y and theta corrected.
 
-        None if it must not be passed on: without a map, damaged, where the map is unknown, or with
-        x or y alone, whose correction depends on the other.
+        None if it must not be passed on: without a map, damaged, where the map is unknown, with a
+        joint named twice, or with x or y alone, whose correction depends on the other.
         """
         sample, use, corrected = self._editor.read(data), self.compensator, None
         if sample is not None and use is not None and (
@@ -191,8 +210,8 @@ class CompensatingSession:
                    ) -> list[float] | None:
         """Return the positions of all joints with the stage's corrected; None if unknown.
 
-        That is: outside the field with outside=refuse, next to an unknown site or line, or no
-        position at all.
+        That is: outside the field with outside=refuse, next to an unknown site or line, no
+        position at all, or a joint named twice.
 
         Parameters
         ----------
@@ -201,9 +220,9 @@ class CompensatingSession:
         by : tuple of callable
             Correction of (x, y) and of theta.
         """
-        if len(positions) != len(names):
-            return None
         place = {name: index for index, name in enumerate(names)}
+        if not len(positions) == len(names) == len(place):
+            return None
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
         stage = [index for index in (x, y, theta) if index is not None]
@@ -271,7 +290,8 @@ class CompensatingSession:
         refused, self._commands_refused = self._commands_refused, 0
         if refused:
             lines.append(f"{refused} commands refused since the last status and not passed on: no "
-                         "map, no complete position, or a position where the map is unknown")
+                         "map, no complete position, a joint named twice, or a position where the map "
+                         "is unknown")
         if oldest > limit:
             lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
                          f"published, max_age is {limit * MS_PER_S:g} ms")

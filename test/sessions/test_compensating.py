@@ -88,7 +88,8 @@ def test_a_command_gets_the_error_added_and_all_else_stays(desk):
 
 
 @pytest.mark.parametrize("names, position", [
-    (["x"], [0.01]), (["y", "theta"], [0.01, 0.0]), (NAMES, [math.nan, 0.0, 0.0]),
+    (["x"], [0.01]), (["y", "theta"], [0.01, 0.0]),
+    (["x", "y", "x"], [0.01, 0.0, 0.01]), (["theta", "theta"], [0.1, 0.1]), (NAMES, [math.nan, 0.0, 0.0]),
     (NAMES, [0.0, 2e12, 0.0]), (NAMES, [-0.02, -0.02, 0.0])])
 def test_a_command_that_cannot_be_corrected_is_not_passed_on(desk, names, position):
     use(desk, random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
@@ -221,11 +222,56 @@ def test_a_file_that_does_not_identify_the_stage_is_refused(tmp_path):
     assert Desk(map=str(path), require_qualified=False).x_at(0.0) is not None
 
 
-def test_a_malformed_map_leaves_the_former_one(desk):
-    desk.session.take_map(map_of())
+def with_value(field: np.ndarray, value: float) -> np.ndarray:
+    """Return a field of a map as in a message, with one value of another kind."""
+    return np.append(field.ravel()[:-1], value)
+
+
+MILLIRADIAN_REACH = 1e-3 / np.hypot(0.02, 0.02)
+"""Angle by which the farthest of 5 x 5 sites of 10 mm moves by 1 mm, rad."""
+
+
+@pytest.mark.parametrize("changes, why", [
+    ({"gx": np.zeros(3)}, "gx has 3 values, the plate 25"),
+    ({"gx": with_value(ONE.gx, math.nan)}, "gx is not finite at 1 of the 25 valid sites"),
+    ({"gy": with_value(ONE.gy, -math.inf)}, "gy is not finite at 1 of the 25 valid sites"),
+    ({"g_theta": with_value(ONE.g_theta, math.inf)}, "g_theta is infinite"),
+    ({"g_theta": np.full(8, math.nan)}, "the error of no site or of no line is known"),
+    ({"valid": [False] * 25}, "the error of no site or of no line is known"),
+    ({"gy": with_value(ONE.gy, -1.01e-3)},
+     "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units"),
+    ({"g_theta": with_value(ONE.g_theta, 1.01 * MILLIRADIAN_REACH)},
+     "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units")])
+def test_a_map_that_harms_leaves_the_former_one_in_use(desk, changes, why):
+    use(desk, TWO)
+    before = desk.session.correct(NAMES, [0.01, -0.01, 0.3])
+    desk.session.take_summary(summary_of(START_NS + 1))
+    with pytest.raises(InputError, match=why):
+        desk.session.take_map(map_of(ONE, START_NS + 1, **changes))
+    assert desk.session.correct(NAMES, [0.01, -0.01, 0.3]) == before
+    assert why in desk.session.diagnosis().message
+    desk.session.take_map(map_of(ONE, START_NS + 1))
+    assert desk.session.correct(NAMES, [0.01, -0.01, 0.3]) != before
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_max_correction_is_the_largest_error_that_is_used(factor):
+    largest = max(np.abs(ONE.gx).max(), np.abs(ONE.gy).max(),
+                  np.abs(ONE.g_theta).max() * np.hypot(0.02, 0.02))
+    desk = Desk(require_qualified=False, max_correction=factor * largest)
+    taken = True
+    try:
+        desk.session.take_map(map_of())
+    except InputError:
+        taken = False
+    assert taken is (factor > 1) and (desk.session.compensator is not None) is taken
+
+
+def test_nan_where_the_map_is_not_valid_is_no_error(desk):
+    """Unknown sites have no value; what stands there is not looked at."""
+    known = [True] * 24 + [False]
+    desk.session.take_map(map_of(ONE, valid=known, gx=with_value(ONE.gx, math.nan)))
     desk.session.take_summary(summary_of())
-    with pytest.raises(InputError, match="gx has 3 values, the plate 25"):
-        desk.session.take_map(map_of(gx=np.zeros(3)))
     assert desk.x_at(0.0) is not None
 
 

@@ -214,6 +214,9 @@ class CompensatorSettings(ManagedSettings):
     require_qualified: bool = declared(
         True, "use only maps that are qualified, of one run, and based on all planned views; false "
         "= any map")
+    max_correction: float = declared(
+        1e-3, "largest error of a map that is used: of a site, and of the farthest site by the "
+        "angular map", "m", 1e-9, 1.0)
     max_map_age: float = declared(
         0.0, "age of the map in use above which there is a warning; 0 = none", "s", 0.0, 1e9)
     max_age: float = declared(
