@@ -17,9 +17,10 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.outputs import write_text
+from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.places import plan_figure
-from selfcal_ros.reporting.report import chapters, svg_file
+from selfcal_ros.reporting.figures.svg import svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.rendering import Camera, Exposure

@@ -15,7 +15,8 @@ from selfcal_ros.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.batch.folder import PER, SCHEMA, Record
 from selfcal_ros.errors import printable
 from selfcal_ros.reporting.figures.drawing import TICK, Drawing, Frame
-from selfcal_ros.reporting.report import inline_svg, page
+from selfcal_ros.reporting.figures.svg import inline_svg
+from selfcal_ros.reporting.report import page
 
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",

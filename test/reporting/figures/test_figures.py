@@ -44,7 +44,7 @@ from selfcal_ros.reporting.figures.residuals import (
     residual_maps,
     residuals_in,
 )
-from selfcal_ros.reporting.report import inline_svg, svg_file
+from selfcal_ros.reporting.figures.svg import inline_svg, svg_file
 from test.support.drawings import cut_off, words_on_words
 from test.support.results import chapters_of, known_result, with_residuals
 
