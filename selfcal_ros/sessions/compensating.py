@@ -290,8 +290,8 @@ class CompensatingSession:
         refused, self._commands_refused = self._commands_refused, 0
         if refused:
             lines.append(f"{refused} commands refused since the last status and not passed on: no "
-                         "map, no complete position, a joint named twice, or a position where the map "
-                         "is unknown")
+                         "map, no complete position, a joint named twice, or a position where the "
+                         "map is unknown")
         if oldest > limit:
             lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
                          f"published, max_age is {limit * MS_PER_S:g} ms")

@@ -89,7 +89,8 @@ def test_a_command_gets_the_error_added_and_all_else_stays(desk):
 
 @pytest.mark.parametrize("names, position", [
     (["x"], [0.01]), (["y", "theta"], [0.01, 0.0]),
-    (["x", "y", "x"], [0.01, 0.0, 0.01]), (["theta", "theta"], [0.1, 0.1]), (NAMES, [math.nan, 0.0, 0.0]),
+    (["x", "y", "x"], [0.01, 0.0, 0.01]), (["theta", "theta"], [0.1, 0.1]),
+    (NAMES, [math.nan, 0.0, 0.0]),
     (NAMES, [0.0, 2e12, 0.0]), (NAMES, [-0.02, -0.02, 0.0])])
 def test_a_command_that_cannot_be_corrected_is_not_passed_on(desk, names, position):
     use(desk, random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
