@@ -131,8 +131,6 @@ SOMETIMES = {
     "map_covariance": "`selfcal combine`: covariance of a mean map up to 21 × 21 sites, lower "
                       "triangles over Gx, then Gy, of the known sites (`xy`) and over the known "
                       "lines (`theta`), in units of scale_xy (m²), scale_theta (rad²)",
-    "prior": "`--prior`: kind, size_m, length_m, left_out (nodes without it), and the map of the "
-             "readings alone: gx, gy, u_gx, u_gy, nonorthogonality, scale_difference",
     "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",

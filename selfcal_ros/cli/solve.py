@@ -70,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "misalignment_model",
           "uncertainty": "uncertainty"}
 REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
-TERMS = {name: name for name in ("drift_degree", "prior", "robust")}
+TERMS = {name: name for name in ("drift_degree", "robust")}
 SENSE = {"sense": "measurement_sense"}
 """Options for parameters of solver and collector -> their names."""
 
@@ -230,7 +230,7 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
     result = with_places(result, measurements.views)
     if args.validate:
         used = clean(measurements, options).measurements if options.robust else measurements
-        found = validate(used, replace(options, prior=""))
+        found = validate(used, options)
         result = judged_by(result, found)
         result = replace(result, extra={
             **result.extra, "validation": validation_json(found, result.plate)})

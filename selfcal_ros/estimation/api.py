@@ -68,9 +68,6 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         raise InputError("method law", "Hu's law cannot use images of several marks",
                          "solve with --method joint")
     if options.plate is not None:
-        if options.prior:
-            raise InputError("prior", f"the plate is known from {options.plate_from}",
-                             "solve without a prior")
         plate = known_plate(options.plate, options.plate_from)
         return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
@@ -91,12 +88,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
     if measurements.has_images:
         result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
-    if not options.prior:
-        return result
-    from selfcal_ros.estimation.comparison.covariance import xy_covariance  # rarely wanted
-    from selfcal_ros.estimation.comparison.prior import with_prior  # likewise
-
-    return with_prior(result, xy_covariance)
+    return result
 
 
 def robust_calibrate(measurements: Measurements,

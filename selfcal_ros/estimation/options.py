@@ -13,9 +13,6 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
 
-PRIORS = ("gp",)
-"""Priors of the map of the stage."""
-
 METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
 MAX_EXPANSION_PER_K = 1e-3
@@ -205,9 +202,6 @@ class Options:
         site of their mark.
     magnification_limit : float
         Difference of the scales of plate and encoders, m/m, beyond which there is a warning.
-    prior : str
-        ``gp``: the map is the mean of a smooth random field given the readings, whose size and
-        correlation length they show. Empty = that of the readings alone.
     robust : bool
         Whether to leave out readings that contradict the others, and to name bad views.
     plate : CalibrationResult, optional
@@ -233,7 +227,6 @@ class Options:
     assumed: tuple[ModelTerm, ...] = DEFAULT_TERMS
     at_places: bool = True
     magnification_limit: float = 1e-4
-    prior: str = ""
     robust: bool = False
     plate: CalibrationResult | None = None
     plate_from: str = ""
@@ -243,8 +236,7 @@ class Options:
         if not self.misalignment_model:
             object.__setattr__(self, "misalignment_model",
                                "linear" if self.method == "law" else "rigid")
-        for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS),
-                            ("prior", ("", *PRIORS))):
+        for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS)):
             if getattr(self, name) not in known:
                 raise InputError(name, f"'{getattr(self, name)}' is unknown",
                                  known_are(str(getattr(self, name)), known))

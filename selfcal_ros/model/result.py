@@ -41,8 +41,6 @@ from selfcal_ros.outputs import plain
 SCHEMA = "selfcal.result/1"
 COMBINED = "combined"
 """Method of a mean of several results, and key of the runs behind it."""
-PRIOR = "prior"
-"""Key of the prior of a map: kind, size, length, nodes left out, and map of the readings alone."""
 LARGEST = 1e3
 """Larger errors and uncertainties, in m or rad, are invalid: sums of their squares overflow."""
 

@@ -9,7 +9,7 @@ from typing import Any
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
-from selfcal_ros.model.result import PRIOR, CalibrationResult
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.units import UM_PER_M
 
@@ -28,16 +28,13 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
     Raises
     ------
     InputError
-        If the result has no uncertainties, a prior is part of it, the temperature of the plate is
+        If the result has no uncertainties, the temperature of the plate is
         not that with which its length was converted, or the readings are not of the days of the
         certificate. A day either way is a time zone.
     """
     if not result.has_uncertainty:
         raise InputError("certificate", "the result has no uncertainties",
                          "solve again with --uncertainty always")
-    if PRIOR in result.extra:
-        raise InputError("certificate", "a prior is part of the map: its uncertainty is not that "
-                         "of readings alone", "solve without a prior")
     _require_temperature(result, details["conditions"])
     core, zone = details["certificate"], timedelta(days=1)
     times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]

@@ -67,13 +67,3 @@ def test_deficient_bag_names_the_unseen_modes(solved):
     assert code == 3
     assert "do not identify the stage" in printed.err and len(printed.err.splitlines()) == 1
     assert result["observability"]["modes"] and result["observability"]["advice"]
-
-
-def test_a_prior_is_refused_where_the_stage_is_rough_from_site_to_site(capsys, tmp_path):
-    """The simulated stages of the shipped bags differ from site to site."""
-    args = ["solve", str(BAGS / "hu_noise"), "--prior", "gp", "-o", str(tmp_path / "r.json")]
-    assert main(args) == 2
-    printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith(
-        "selfcal solve: prior: the stage's error is correlated over 0.")
-    assert printed.err.count("\n") == 1 and not list(tmp_path.iterdir())

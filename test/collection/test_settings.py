@@ -242,10 +242,3 @@ def test_what_a_plan_knows_of_its_microscope_outlives_another_model():
     assert model_of(planned, model_terms=["none"]) == []
     # a plan that only wants one estimated says nothing about it
     assert model_of(("microscope",), model_terms=["drift"]) == ["drift", *ASSUMED]
-
-
-def test_the_prior_of_the_settings_is_that_of_the_options():
-    assert solver_options(SolverSettings.checked({}, "here")).prior == ""
-    assert solver_options(SolverSettings.checked({"prior": "gp"}, "here")).prior == "gp"
-    with pytest.raises(InputError, match="prior"):
-        SolverSettings.checked({"prior": "rbf"}, "here")

@@ -24,7 +24,7 @@ from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import PRIOR, result_from_dict, result_to_dict
+from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
@@ -403,13 +403,6 @@ def test_a_mean_has_u_of_its_squareness():
     assert pytest.approx(k * np.sqrt(row @ cover @ row), rel=1e-4) == U_O
     assert k == pytest.approx(mean.noise.k_xy, rel=1e-4) and value == pytest.approx(
         mean.error_map.nonorthogonality)
-
-
-def test_a_prior_is_refused_for_people_too():
-    held = replace(RESULT, extra={**RESULT.extra, PRIOR: {}})
-    for write in (certificate, certificate_chapter):
-        with pytest.raises(InputError, match="a prior is part of the map"):
-            write(held, details())
 
 
 def without(*path):

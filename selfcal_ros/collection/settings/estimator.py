@@ -119,7 +119,6 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    drift_degree=settings.drift_degree, plate_from=plate_from,
                    plate=read_result(plate_from) if plate_from else None,
                    magnification_limit=settings.magnification_limit,
-                   prior="" if settings.prior == "none" else settings.prior,
                    robust=settings.robust)
 
 

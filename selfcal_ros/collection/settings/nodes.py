@@ -158,8 +158,6 @@ class SolverSettings(ManagedSettings):
                                           "above which there is a warning", "m/m", 0.0, 1.0)
     drift_degree: int = declared(DRIFT_DEGREE, "degree of the polynomial of time for the drift of "
                                  "a view, if drift is a term", "", 1, MAX_DRIFT_DEGREE)
-    prior: str = declared("none", "prior for the stage's map: gp = a smooth error, size and "
-                          "correlation length from the readings", choices=("none", "gp"))
     robust: bool = declared(False, "leave out readings that contradict the others")
     save_path: str = declared("", "RESULT.json to write whenever the map changes; {run_id} in it "
                               "is replaced by the run; empty = none")

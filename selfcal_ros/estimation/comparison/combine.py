@@ -36,7 +36,6 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.result import (
     COMBINED,
-    PRIOR,
     ArtifactMap,
     CalibrationResult,
     Noise,
@@ -147,9 +146,6 @@ def _require_single_run(part: Part, others: Sequence[Part]) -> None:
     result = part.origin
     if result is None:
         return
-    if PRIOR in result.extra:
-        raise InputError(part.name, "a prior is part of its map, the same in every run",
-                         "solve it without a prior")
     if result.method == COMBINED:
         raise InputError(part.name, "a mean of several runs", "name these runs themselves")
     for other in others:

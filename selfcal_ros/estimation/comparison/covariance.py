@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.prior import after_prior
 from selfcal_ros.estimation.datum.angular import conditions_for, lines_alone
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import IMAGES, ImageNoise, stops_of
@@ -27,7 +26,7 @@ from selfcal_ros.estimation.normal.systems import Marks, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.result import COMBINED, PRIOR, CalibrationResult
+from selfcal_ros.model.result import COMBINED, CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations
 
 MAX_LINES = 1024
@@ -45,8 +44,6 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
 
     (2n, 2n), or the variances (2n,) if the correlations are unknown.
     """
-    if PRIOR in result.extra:
-        return after_prior(result, known, xy_covariance), True
     emap = result.error_map
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
     if "xy" in (stored := result.extra.get(COVARIANCE, {})):
@@ -155,7 +152,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
-    if {PRIOR, COVARIANCE} & result.extra.keys() or result.method in ("law", COMBINED):
+    if COVARIANCE in result.extra or result.method in ("law", COMBINED):
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
         cover, whole = xy_covariance(result, known)
         if not whole:

@@ -22,7 +22,6 @@ from selfcal_ros.estimation.comparison.covariance import (
     system_behind,
     unit_rows,
 )
-from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import ImageNoise
@@ -194,7 +193,6 @@ class Together:
 
 def together(result: CalibrationResult) -> Together | None:
     """Return the joint covariance of stage and plate of a result; None if it is incomplete."""
-    result = measured_alone(result)
     if result.method != "joint" or (
             result.model.terms and BESIDE not in result.extra.get(KEY, {})) \
             or max(result.artifact.m.size, result.plate.m.size) > MAX_SITES:

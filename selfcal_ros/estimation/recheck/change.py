@@ -20,7 +20,6 @@ from selfcal_ros.estimation.comparison.maps import (
     significance,
     without,
 )
-from selfcal_ros.estimation.comparison.prior import measured_alone
 from selfcal_ros.estimation.comparison.together import Together, together
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.placed import MapSpline
@@ -92,7 +91,6 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(where, "is not qualified, so its plate is not known",
                          "calibrate again")
-    result = measured_alone(result)
     kept = together(result)
     if kept is None:
         raise InputError(where, "does not contain the covariance of its plate",

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.result import PRIOR, CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.summary.numbers import (
@@ -336,8 +336,7 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = (f" at {figures.n_known} of {figures.n_sites} sites"
              if figures.n_known < figures.n_sites else "")
     views = counted_views(result.views, measured) + of_few_read(result.findings)
-    text = f"Calibrated{share} from {views}" + (
-        " with a prior" if PRIOR in result.extra else "")
+    text = f"Calibrated{share} from {views}"
     if not figures.n_known:
         return text
     k = result.noise.k_xy

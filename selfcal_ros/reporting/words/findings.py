@@ -209,13 +209,6 @@ SENTENCES: dict[str, Words] = {
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
         "marks there and back, along x and along y"),
-    "prior": lambda f, of: (
-        "the map has a prior: its error beyond first order is modelled as a smooth random field of "
-        f"{f.size * UM_PER_M:.3g} µm with a correlation length of {of['length_m'] * MM_PER_M:.3g} "
-        "mm, estimated from the readings; without it u would be "
-        f"{of['u_rms_without'] * UM_PER_M:.3g} instead of {of['u_rms'] * UM_PER_M:.3g} µm (rms)" + (
-            f"; {_counted([tuple(at) for at in of['left_out']], 'node')} may deviate from that "
-            "field: no prior there" if of["left_out"] else "")),
     "few_read": phrases.few_read_text, "repeats_contradict": phrases.repeats_contradict_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (

@@ -90,9 +90,6 @@ def line_text(line: BudgetLine) -> str:
                     line.component, f"uncertainties of {of['runs']} runs, by their weights")
     if "kind" in of:
         return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
-    if "prior_length_m" in of:
-        length_mm = of["prior_length_m"] * MM_PER_M
-        return f"prior of the stage's error, correlated over {length_mm:.3g} mm"
     if "plate" in of:
         return OF_RECHECK[line.component].format(of["plate"])
     if line.component == INTERPOLATION:
