@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import runpy
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -6,6 +7,9 @@ from setuptools import find_packages, setup
 NAME = "selfcal_ros"
 NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
          "bag_player", "bag_recorder", "stage_simulator")
+
+
+VERBS = runpy.run_path(str(Path(NAME, "cli", "verbs.py")))
 
 
 def share(folder: str) -> list[tuple[str, list[str]]]:
@@ -46,5 +50,6 @@ setup(
             "selfcal = selfcal_ros.start:selfcal",
             *(f"{node} = {NAME}.start:{node}" for node in NODES),
         ],
+        VERBS["ENTRY_POINTS"]: [f"{verb} = {VERBS['module_of'](verb)}" for verb in VERBS["VERBS"]],
     },
 )

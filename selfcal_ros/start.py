@@ -6,6 +6,7 @@ the system until `cli.main.main` or `nodes.running.run` unblock it.
 """
 
 import importlib.util
+import os
 import signal
 import sys
 from functools import partial
@@ -39,8 +40,22 @@ def begin_node() -> None:
         sys.exit(2)
 
 
+def open_streams() -> None:
+    """Give a standard stream that was closed at the start (``>&-``) a place to write to.
+
+    Else Python has None for it, and the next file that is opened takes its number.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number is this one
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
+
+
 def selfcal() -> int:
     """Run the command ``selfcal``."""
+    open_streams()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     return importlib.import_module("selfcal_ros.cli.main").main()
 

@@ -50,14 +50,14 @@ def demo() -> int:
     if code:
         return code
     if sys.stdout.isatty():
-        tell("\n".join(["", *map_picture(result.error_map), ""]))
+        tell("\n".join(["", *shades(result.error_map), ""]))
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
                        ("report.html", "report: open it")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
     return 0
 
 
-def map_picture(emap: "ErrorMap") -> list[str]:
+def shades(emap: "ErrorMap") -> list[str]:
     """Return the length of the error at the sites as shades, y upwards; ``?`` = not known."""
     import numpy as np
 

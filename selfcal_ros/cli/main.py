@@ -1,78 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ``selfcal`` command: find the verbs, run one, turn errors into exit codes.
 
-A verb is a module of this package with ``configure(parser)`` and ``run(args) -> int``. It is
-imported when it is asked for, so that ``selfcal --help`` does not load numpy.
+A verb is a module with ``configure(parser)`` and ``run(args) -> int``, of this package or of
+another one (`selfcal_ros.cli.verbs`). It is imported when it is asked for, so that
+``selfcal --help`` does not load numpy.
 """
 
 import argparse
 import importlib
 import os
+import shutil
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NoReturn
 
-from selfcal_ros import __version__, cli
+from selfcal_ros import __version__
+from selfcal_ros.cli.verbs import (
+    EXAMPLES,
+    GROUPS,
+    MORE,
+    START_HERE,
+    VERBS,
+    module_of,
+    summary_of,
+    verbs_of_others,
+)
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, did_you_mean, printable
-
-VERBS = {
-    "apply": "correct a table of positions: commands for true positions, or the inverse",
-    "batch": "calibrate from many bags on all cores: one table, trends and changes over time",
-    "cal": "read, check, evaluate, write and verify calibration files for Aerotech controllers",
-    "call": "ask the sequencer of a running cell: start, confirm, redo, skip or abort",
-    "camera": "find the pixel size, rotation and mirroring of a camera",
-    "cell": "check a machine cell before its first calibration",
-    "certificate": "write a digital calibration certificate: DCC 3.3.0 (XML)",
-    "combine": "combine several calibrations of a stage into one map",
-    "detect": "find the marks in the images of a bag",
-    "diff": "compare two results after removing the datum difference",
-    "embed": "keep result, plan and exports in the bag, as MCAP attachments",
-    "export": "write the map of a result as a table for a controller",
-    "gcode": "correct a G-code program: for controllers without tables",
-    "iso230": "figures of ISO 230: accuracy and repeatability of axes, circularity, diagonals",
-    "monitor": "show a running cell on one screen, and operate its sequencer by keys",
-    "plan": "check a plan of views before it is measured, or suggest views",
-    "plot": "draw the maps of a result: png, svg or pdf",
-    "recheck": "check whether a calibrated stage has changed, from one view of the same plate",
-    "replay": "play a bag into the live nodes and take the map from them",
-    "report": "write a calibration report: one self-contained HTML or PDF file",
-    "reproduce": "repeat the published simulations of Hu or Qiao, next to the published figures",
-    "simulate": "write a bag of a simulated cell, with its known truth",
-    "solve": "calibrate from a bag: MCAP file or rosbag2 folder",
-    "step-diagonal": "identify linear, straightness and squareness errors from a laser "
-                     "step-diagonal measurement",
-    "table": "write the maps of a result as a table: csv or npz",
-    "trace": "show which result a table was exported from, and whether both are unchanged",
-    "up": "start and supervise the nodes of a cell, and run a calibration on one screen"}
-"""Verbs and what they do; `step-diagonal` is the module ``step_diagonal.py`` of this package."""
 
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
 
-def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+def build_parser(only: str | None = None) -> "Parser":
     """Return the parser of all verbs, or of `only` alone if it is a verb.
 
-    If it is none, no verb is imported: their names and help are known without.
+    If it is not one, no verb is imported: their names and help are known without.
     """
-    parser = Parser(
-        prog="selfcal", description="Self-calibration of XY-theta stages.",
-        epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not identify "
-               "the stage, 4 no usable data, 5 not qualified, 1 internal error")
+    parser = Front(prog="selfcal", description="Calibrates XY-theta stages from readings of a "
+                   "plate in several views, and states the uncertainty of every number.",
+                   epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not "
+                   "identify the stage, 4 no usable data, 5 written but not qualified, 1 internal "
+                   "error")
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
-    group = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    group = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=Parser)
     for name in [only] if only in VERBS else VERBS:
-        sub = group.add_parser(name, help=VERBS[name], description=VERBS[name])
+        sub = group.add_parser(name, help=VERBS[name].what, description=VERBS[name].what)
         if only in (None, name):
-            module = importlib.import_module(f"{cli.__name__}.{name.replace('-', '_')}")
-            module.configure(sub)
-            sub.set_defaults(run=module.run)
+            _configure(sub, importlib.import_module(module_of(name)))
+            for words, leaf in _leaves(sub, name):
+                leaf.example = EXAMPLES.get(words, "")
+    if only not in VERBS:
+        for name, point in verbs_of_others().items():
+            sub = group.add_parser(name, help=summary_of(point), description=summary_of(point))
+            if only == name:
+                _configure(sub, point.load())
     return parser
 
 
+def _configure(parser: argparse.ArgumentParser, module: Any) -> None:
+    """Add the arguments of a verb."""
+    module.configure(parser)
+    parser.set_defaults(run=module.run)
+
+
+def _leaves(parser: "Parser", words: str) -> Iterator[tuple[str, "Parser"]]:
+    """Yield the words and the parser of a verb, or of each of its second words."""
+    groups = [action for action in parser._actions
+              if isinstance(action, argparse._SubParsersAction)]
+    if not groups:
+        yield words, parser
+    for group in groups:
+        for word, sub in group.choices.items():
+            yield from _leaves(sub, f"{words} {word}")
+
+
 def _verb_in(words: Iterable[str]) -> str:
-    """Return the first word that is no option, empty if there is none."""
+    """Return the first word that is not an option, empty if there is none."""
     return next((word for word in words if not word.startswith("-")), "")
 
 
@@ -86,39 +91,71 @@ def _complete() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
-    prefix = "selfcal"
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
         if COMPLETE in os.environ:
             _complete()
-        words = sys.argv[1:] if argv is None else argv
-        parser = build_parser(_verb_in(words))
-        args = parser.parse_args(argv)
-        args.words = words
-        prefix = f"selfcal {args.verb}"
-        code = int(args.run(args))
+        code = _run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()
         return code
-    except SelfcalError as error:
-        print(f"{prefix}: {error}", file=sys.stderr)
-        return int(error.exit_code)
-    except KeyboardInterrupt:
-        print(f"{prefix}: interrupted", file=sys.stderr)
-        return 128 + signal.SIGINT
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # whoever read has enough
+        _say_no_more()
         return int(ExitCode.DONE)
+
+
+def _run(words: list[str]) -> int:
+    """Run one verb; an error is one line on stderr."""
+    prefix = "selfcal"
+    try:
+        if words[:1] == ["help"]:
+            words = [*words[1:], "--help"]
+        parser = build_parser(_verb_in(words))
+        if not words:
+            parser.print_help()
+            return int(ExitCode.DONE)
+        args = parser.parse_args(words)
+        args.words = words
+        prefix = f"selfcal {args.verb}"
+        return int(args.run(args))
+    except SelfcalError as error:
+        return _refused(f"{prefix}: {error}", error.exit_code)
+    except KeyboardInterrupt:
+        return _refused(f"{prefix}: interrupted", 128 + signal.SIGINT)
     except ModuleNotFoundError as error:
-        print(f"{prefix}: there is no module {error.name} in this environment; install it, see "
-              "README", file=sys.stderr)
-        return int(ExitCode.BAD_INPUT)
+        return _refused(f"{prefix}: there is no module {error.name} in this environment; "
+                        f"{_remedy(error.name)}", ExitCode.BAD_INPUT)
+    except BrokenPipeError:
+        raise
     except OSError as error:  # a name too long, a disk that fails
         if error.errno is None:
             raise
         fault = InputError(error.filename or "system", str(error.strerror),
                            "check path, disk and permissions")
-        print(f"{prefix}: {fault}", file=sys.stderr)
-        return int(fault.exit_code)
+        return _refused(f"{prefix}: {fault}", fault.exit_code)
+
+
+def _refused(line: str, code: int) -> int:
+    """Print a line on stderr, if somebody reads it, and return the exit code."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        _say_no_more()
+    return int(code)
+
+
+def _say_no_more() -> None:
+    """Let everything that is still printed go nowhere, also at the end of the process."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def _remedy(module: str | None) -> str:
+    """Return what to do about a module that is missing."""
+    if module in sys.stdlib_module_names:
+        return "this needs Linux: verbs that work on bags and results run everywhere"
+    return "install it, see README"
 
 
 class Parser(argparse.ArgumentParser):
@@ -126,11 +163,19 @@ class Parser(argparse.ArgumentParser):
 
     An unknown verb, choice or option is answered with similar ones.
     Sub-parsers are of this class, too. ``leaf`` of the arguments is the innermost parser.
+    Its help ends with an example.
     """
+
+    example = ""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.set_defaults(leaf=self)
+
+    def format_help(self) -> str:
+        """Return the help, with the example as it is typed."""
+        text = super().format_help()
+        return f"{text}\nexample:\n  {self.example}\n" if self.example else text
 
     def parse_args(self, args: Sequence[str] | None = None,  # type: ignore[override]
                    namespace: argparse.Namespace | None = None) -> argparse.Namespace:
@@ -170,6 +215,42 @@ class Parser(argparse.ArgumentParser):
         known = list(choices)
         hint = did_you_mean(str(value), known) or f"known are {', '.join(known)}"
         raise argparse.ArgumentError(None, f"{_name_of(action)} '{value}' is unknown; {hint}")
+
+
+class Front(Parser):
+    """The parser of all verbs: its help has them in groups."""
+
+    def format_help(self) -> str:
+        """Return the help: where to start, then the verbs in groups."""
+        width = shutil.get_terminal_size().columns - 2
+        lines = ["usage: selfcal VERB ...", "", *textwrap.wrap(str(self.description), width),
+                 "", "start here", *_columns({f"selfcal {command}": what for command, what
+                                              in START_HERE.items()}, width)]
+        offered = {action.dest: str(action.help) for action in self._verbs()}
+        longest = max(map(len, offered))
+        for group in GROUPS:
+            rows = {name.ljust(longest): text for name, text in offered.items()
+                    if (VERBS[name].group if name in VERBS else MORE) == group}
+            lines += ["", group, *_columns(rows, width)]
+        lines += ["", *textwrap.wrap(str(self.epilog), width),
+                  "selfcal --version shows the version"]
+        return "\n".join(lines) + "\n"
+
+    def _verbs(self) -> list[argparse.Action]:
+        return [action for group in self._actions
+                if isinstance(group, argparse._SubParsersAction)
+                for action in group._choices_actions]
+
+
+def _columns(rows: dict[str, str], width: int) -> list[str]:
+    """Return names and texts in two columns."""
+    left = max(map(len, rows)) + 4
+    lines = []
+    for name, text in rows.items():
+        first, *more = textwrap.wrap(text, max(width - left, 20)) or [""]
+        lines.append(f"  {name:{left - 4}}  {first}")
+        lines += [" " * left + line for line in more]
+    return lines
 
 
 def _name_of(action: argparse.Action) -> str:

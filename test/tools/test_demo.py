@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The picture of the map in letters that `make demo` shows in a terminal."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from test.support.results import known_result
-from tools.demo import map_picture
+from test.support.sources import ROOT
+from test.support.terminals import in_terminal
+from tools.demo import shades
 
 
 def picture(size, fill):
     emap = known_result(size, 0)[0].error_map
     gx = np.zeros((size, size))
     fill(gx)
-    return map_picture(replace(emap, gx=gx, gy=np.zeros_like(gx)))
+    return shades(replace(emap, gx=gx, gy=np.zeros_like(gx)))
 
 
 def test_shades_stand_where_the_errors_are_with_y_upwards():
@@ -28,3 +32,12 @@ def test_large_and_unknown_fields_are_small_pictures():
     lines = picture(101, lambda gx: gx.fill(np.nan))
     assert len(lines) == 26 and set("".join(lines[:-1])) == {" ", "?"}
     assert all(len(line) < 60 for line in lines[:-1])
+
+
+@pytest.mark.ros
+def test_the_demo_in_a_terminal_ends_with_its_picture_and_its_files():
+    code, said = in_terminal([sys.executable, str(ROOT / "tools/demo.py")], folder=ROOT)
+    assert code == 0, said
+    assert "length of the error: from ' ' = 0 to '@' =" in said
+    for name in ("result.json", "map.png", "report.html"):
+        assert f"build/demo/{name}" in said and (ROOT / "build/demo" / name).exists()
