@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from selfcal_ros.model.error_map import ErrorMap
+    from selfcal_ros.model.result import CalibrationResult
 
 ROOT = Path(__file__).parents[1]
-BAG = ROOT / "bags" / "hu_noise"
+BAG = ROOT / "bags" / "demo"
 FOLDER = ROOT / "build" / "demo"
 
 MOST = 27
@@ -50,7 +51,7 @@ def demo() -> int:
     if code:
         return code
     if sys.stdout.isatty():
-        tell("\n".join(["", *shades(result.error_map), ""]))
+        tell("\n".join(["", *shades(result.error_map), *known_to(result), ""]))
     for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
                        ("report.html", "report: open it")):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
@@ -77,6 +78,16 @@ def shades(emap: "ErrorMap") -> list[str]:
     return [f"  {row}" for row in rows] + [
         f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} µm; x to the right, "
         "y upwards"]
+
+
+def known_to(result: "CalibrationResult") -> list[str]:
+    """Return the line with the uncertainty of the map, at its nodes and between them."""
+    from selfcal_ros.estimation.verdict.uncertainty import budgets
+    from selfcal_ros.reporting.summary.numbers import um
+
+    nodes, anywhere = (budget for budget in budgets(result) if budget.quantity == "xy")
+    return [f"  known to ±{um(nodes.U_max)} at the nodes, ±{um(anywhere.U_max)} anywhere "
+            f"(k={nodes.k:.3g})"]
 
 
 if __name__ == "__main__":

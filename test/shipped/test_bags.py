@@ -14,8 +14,10 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.reporting.summary.numbers import summary_numbers, um
+from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.vision.exposures import ImageDetector
 from test.support.options import BARE
 
@@ -91,7 +93,7 @@ def test_noise_free_bag_gives_the_truth_to_rounding():
 
 
 @pytest.mark.parametrize("terms", ["", "microscope"])
-@pytest.mark.parametrize("name", ["hu_noise", "fig10_faults"])
+@pytest.mark.parametrize("name", ["hu_noise", "fig10_faults", "demo"])
 def test_every_site_lies_within_five_standard_uncertainties_of_the_truth(name, terms):
     """A microscope is hardly told by what it saw beside marks that the stage stopped on."""
     result = calibrate(measured(name)[0], Options(terms=parse_terms([terms], "")))
@@ -103,6 +105,17 @@ def test_every_site_lies_within_five_standard_uncertainties_of_the_truth(name, t
                            (emap.g_theta, emap.u_g_theta, truth["g_theta"])):
         assert np.isfinite(found).all()
         assert (np.abs(found - np.array(true)) <= 5 * u).all()
+
+
+def test_the_stage_of_the_demo_is_known_between_its_nodes_too():
+    """Its error is smooth, as that of a stage is: what is corrected anywhere is worth it."""
+    result = calibrate(measured("demo").measurements)
+    nodes, anywhere = (budget for budget in budgets(result) if budget.quantity == "xy")
+    assert nodes.U_max < anywhere.U_max < 0.1 * np.nanmax(np.hypot(
+        result.error_map.gx, result.error_map.gy))
+    said = summary_text(result)
+    assert f"U {um(nodes.U_rms)} rms, {um(nodes.U_max)} largest (k=2" in said
+    assert f"anywhere           U {um(anywhere.U_rms)} rms, at most {um(anywhere.U_max)}" in said
 
 
 def test_faults_that_survive_the_encoder_are_all_found():

@@ -147,7 +147,7 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
         parts.arrows(frame, at, fields[1], factor, colour="truth", width=3.4, heads=False)
         entries.append(("truth", "known truth"))
     if _ellipses(frame, tips[0], around):
-        entries.append(("band", f"U, k = {k:.3g}"))
+        entries.append(("band", f"U at the nodes, k = {k:.3g}"))
     parts.arrows(frame, at, fields[0], factor)
     frame.axes(x_label=f"{of} x in mm", y_label=f"{of} y in mm")
     left, top, width, height = frame.box

@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
+from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.pose import without_cell
@@ -192,6 +193,7 @@ def error_section(result: CalibrationResult) -> Section:
     u_o, u_r = _first_order_u(result)
     facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
                              (result.noise.k_xy, result.noise.dof_of("xy"))),
+              *_between_nodes(result),
               *(("not in U", printable(excluded_text(line))) for line in result.excluded),
               ("non-orthogonality", _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad",
                                                 "out of square by 2|O|")),
@@ -200,6 +202,17 @@ def error_section(result: CalibrationResult) -> Section:
     if emap.artifact.angular_count:
         facts += _theta_facts(result)
     return Section("Stage error (indicated − true)", tuple(facts))
+
+
+def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
+    """Return U of one coordinate anywhere in the field, where the map is interpolated."""
+    try:
+        known = budgets(result)
+    except InputError:  # damaged factors: the map can be shown all the same
+        return []
+    return [("anywhere", f"U {um(budget.U_rms)} rms, at most {um(budget.U_max)} "
+             f"(k={budget.k:.3g}), the map interpolated between its nodes")
+            for budget in known if budget.quantity == "xy" and budget.anywhere]
 
 
 def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
