@@ -118,6 +118,7 @@ def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures
     low = detections[(detections["kind"] == Kind.GRID) & (detections["score"] < rules.min_score)]
     if not len(low):
         return readings
+    low = low[np.argsort(low["stamp"], kind="stable")]  # whatever the order of arrival
     stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
     places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object),
                np.stack([stage.x.position, stage.y.position]))

@@ -19,14 +19,13 @@ from selfcal_ros.model.readings import (
     GridVisits,
     Measurements,
     RepeatMotion,
+    ViewReadings,
 )
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
-ECHO_LENGTH = 128
-"""Length of a string shown by `ros2 topic echo`."""
 Fields = dict[str, Any]
 
 
@@ -111,7 +110,8 @@ def command(c: Command, frame_id: str) -> Fields:
             "model_terms": list(c.model_terms),
             "check_marks": c.view.check_marks if c.view else 0,
             "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact),
-            **_image(c.view), "artifact_from": c.artifact_from, **_marks(c.artifact)}
+            **_image(c.view), "artifact_from": c.artifact_from, **_marks(c.artifact),
+            "plan_keys": []}
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -157,7 +157,8 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         **_map_grid(measurements.artifact), **_image(readings.view),
         "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1],
         "artifact_from": measurements.artifact_from, **_marks(measurements.artifact),
-        "axis_theta": readings.axis_theta}
+        "axis_theta": readings.axis_theta, "visit_order": readings.view.visit_order,
+        **_places(readings), "plan_keys": []}
 
 
 def _visits(visits: GridVisits | None) -> Fields:
@@ -166,6 +167,13 @@ def _visits(visits: GridVisits | None) -> Fields:
               for name, _ in VISIT_COLUMNS}
     return {**fields, "sigma_visit": visits.sigma_m if visits else float("nan"),
             "dof_visit": visits.dof if visits else 0}
+
+
+def _places(readings: ViewReadings) -> Fields:
+    """Return the fields of the positions of rejected detections."""
+    number = {reason: index for index, reason in enumerate(readings.rejected)}
+    return {"rejected_reason": [number[reason] for reason in readings.places.reason],
+            "rejected_x": readings.places.x, "rejected_y": readings.places.y}
 
 
 def _motion(name: str, motion: RepeatMotion | None) -> Fields:
@@ -192,15 +200,6 @@ def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields
         "identifiable": result.observability.identifiable,
         "qualified": result.verdict.qualified, "run_id": result.run_id,
         "grade": grade_number(result), "interpolation": result.interpolation}
-
-
-def short(sentence: str) -> str:
-    """Return a sentence without trailing clauses that `ros2 topic echo` would truncate."""
-    if len(sentence) <= ECHO_LENGTH:
-        return sentence
-    head = sentence[:ECHO_LENGTH]
-    end = max(head.rfind(mark) for mark in ("; ", ", ", ": "))
-    return (head[:end] if end > 0 else head[:-1]) + "."
 
 
 def grade_number(result: CalibrationResult) -> int:

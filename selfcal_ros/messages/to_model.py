@@ -25,6 +25,7 @@ from selfcal_ros.model.readings import (
     COLUMNS,
     VISIT_COLUMNS,
     GridVisits,
+    RejectedPlaces,
     RepeatMotion,
     Sense,
     ViewReadings,
@@ -76,10 +77,11 @@ def command(message: Any) -> Command:
     Raises
     ------
     InputError
-        For an unknown phase, an invalid plate, or a stamp before 1970.
+        For an unknown phase, an invalid plate, a stamp before 1970, or an unknown key of the plan.
     """
     if stamp_ns(message) < 0:
         raise InputError(COMMAND_TOPIC, "the stamp is before 1970", "set the clock")
+    refuse_unknown_keys(message, COMMAND_TOPIC)
     try:
         phase = Phase(int(message.phase))
     except ValueError as error:
@@ -94,6 +96,13 @@ def command(message: Any) -> Command:
         views_planned=int(getattr(message, "views_planned", 0)),
         run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message),
         artifact_from=plate_from(message))
+
+
+def refuse_unknown_keys(message: Any, topic: str) -> None:
+    """Raise InputError if a ViewCommand or ViewMeasurement has a key of a plan unknown here."""
+    for text in getattr(message, "plan_keys", ()):
+        raise InputError(topic, f"the key {printable(str(text).partition(':')[0])!r} of the plan "
+                         "is not known here", "run all nodes in the newer version")
 
 
 def terms_of(message: Any) -> tuple[str, ...]:
@@ -174,8 +183,10 @@ def view_readings(message: Any) -> ViewReadings:
     Raises
     ------
     InputError
-        If arrays that belong together differ in length; `u` and `u_theta` may be empty.
+        If arrays that belong together differ in length (`u` and `u_theta` may be empty), or the
+        plan has an unknown key.
     """
+    refuse_unknown_keys(message, f"{MEASUREMENT_TOPIC} of '{message.view_name}'")
     table: dict[str, Any] = {name: np.array(getattr(message, name), dtype=kind)
                              for name, kind in COLUMNS}
     for *names, u in (("m", "n", "dx", "dy", "count", "u"),
@@ -191,7 +202,8 @@ def view_readings(message: Any) -> ViewReadings:
         sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
         dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
         used=int(message.detections_used), rejected=counts(message, "reject"),
-        visits=_visits_of(message), motion=_motion_of(message, "motion", 4),
+        visits=_visits_of(message), places=_places_of(message),
+        motion=_motion_of(message, "motion", 4),
         motion_theta=_motion_of(message, "motion_theta", 2), axis_theta=float(message.axis_theta))
 
 
@@ -219,6 +231,18 @@ def _visits_of(message: Any) -> GridVisits | None:
                          "the visits differ in length or name marks that were not read",
                          "correct the publisher")
     return GridVisits(**table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit))
+
+
+def _places_of(message: Any) -> RejectedPlaces:
+    """Return the positions of rejected detections in a ViewMeasurement."""
+    number, x, y = (np.array(getattr(message, f"rejected_{name}"), dtype=kind)
+                    for name, kind in (("reason", int), ("x", float), ("y", float)))
+    reasons = list(map(str, message.reject_reasons))
+    if not len(number) == len(x) == len(y) or (number >= len(reasons)).any():
+        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+                         "the rejected detections differ in length or name no reason",
+                         "correct the publisher")
+    return RejectedPlaces(tuple(reasons[index] for index in number), x, y)
 
 
 def counts(message: Any, prefix: str) -> dict[str, int]:

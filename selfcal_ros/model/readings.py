@@ -327,6 +327,8 @@ def _digest(readings: ViewReadings) -> str:
     for motion in (readings.motion, readings.motion_theta):
         if motion:
             digest.update(motion.products.tobytes() + repr(motion.dof).encode())
+    digest.update(repr(readings.places.reason).encode())
+    digest.update(readings.places.x.tobytes() + readings.places.y.tobytes())
     # the readings, not the settings of the measurement
     view = replace(readings.view, visit_order="", check_marks=0, check_offset_m=0.0)
     digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,

@@ -9,6 +9,7 @@ from typing import Any
 
 from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
+from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
@@ -19,7 +20,7 @@ from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
-from selfcal_ros.reporting.summary.sections import state_sentence
+from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
@@ -52,13 +53,18 @@ class Outcome:
 def solve(job: Job) -> Outcome:
     """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
-        result = worded(calibrate(job.measurements, job.options))
-        return Outcome(job, results.with_warnings(result, job.notes), None)
+        return Outcome(job, _finished(job, calibrate(job.measurements, job.options)), None)
     except NotIdentifiableError as error:
-        result = worded(results.unidentified_result(job.measurements, error.observability))
-        return Outcome(job, results.with_warnings(result, job.notes), error)
+        result = results.unidentified_result(job.measurements, error.observability)
+        return Outcome(job, _finished(job, result), error)
     except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
+
+
+def _finished(job: Job, result: results.CalibrationResult) -> results.CalibrationResult:
+    """Return the result of a job with everything that a result from the bag has."""
+    result = worded(with_places(result, job.measurements.views))
+    return results.with_warnings(result, job.notes)
 
 
 @cache
@@ -295,7 +301,7 @@ class SolvingSession:
             advice = [str(shown.problem)] if result is None else list(result.observability.advice)
         self._ports.publish("summary", {
             "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
-            "state": from_model.short(self._state()), "views_done": shown.views_done,
+            "state": self._state(), "views_done": shown.views_done,
             "views_planned": planned,
             "identifiable": result is not None and result.observability.identifiable,
             "rank_deficiency": 0 if result is None else result.observability.deficiency,
@@ -326,7 +332,7 @@ class SolvingSession:
             return f"{views}, not yet enough to identify the stage."
         if self.shown.problem is not None or self.shown.result is None:
             return str(self.shown.problem)
-        return state_sentence(self.shown.result)
+        return state_line(self.shown.result)
 
     def digest(self) -> str:
         """Return the fingerprint of the readings behind the published map; "" = none."""
@@ -335,17 +341,24 @@ class SolvingSession:
     def save(self, path: str) -> tuple[str, str]:
         """Write the published result; return a line for the log, and the absolute path.
 
+        A result without a map, of readings that do not identify the stage, is written as well, but
+        replaces no file.
+
         Raises
         ------
         SelfcalError
             If there is no map, or `path` is outside the folder for results.
         """
-        if self.shown.problem is not None:
-            raise self.shown.problem
+        problem = self.shown.problem
         if self.shown.result is None:
-            raise NoDataError("solver", "there is no map yet", "measure the views of the plan")
+            raise problem or NoDataError("solver", "there is no map yet",
+                                         "measure the views of the plan")
         target = result_file(path, self._settings.result_folder)
+        if problem is not None and target.exists():
+            raise problem
         write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
+        if problem is not None:
+            raise problem
         self._saved = str(target)
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")

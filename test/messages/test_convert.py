@@ -18,7 +18,14 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion, Sense, ViewReadings
+from selfcal_ros.model.readings import (
+    GridVisits,
+    Measurements,
+    RejectedPlaces,
+    RepeatMotion,
+    Sense,
+    ViewReadings,
+)
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.model.view import ORDERS, View
 from test.support.bags import contract_message, contract_types
@@ -123,7 +130,7 @@ def test_fields_of_a_command_by_name():
         "angular": False, "repeats": 7, "grid_size": 5, "grid_pitch": 0.0125, "angular_count": 8,
         "grid_size_y": 7, "views_planned": 9, "visit_order": "x_then_y", "run_id": "",
         "model_terms": ["drift:1e-08"], "check_marks": 3, "check_offset": 2e-5, **MAP_FIELDS,
-        **NO_IMAGE, "artifact_from": "/r.json", **NO_MARKS}
+        **NO_IMAGE, "artifact_from": "/r.json", **NO_MARKS, "plan_keys": []}
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -197,7 +204,7 @@ def test_view_measurements_come_back(read, artifact, rejected, sense):
     message = through_cdr("ViewMeasurement", from_model.view_measurement(
         progress, whole, STAMP_NS, "f"))
     found = to_model.view_readings(message)
-    for entry in fields(ViewReadings):
+    for entry in (entry for entry in fields(ViewReadings) if entry.name != "places"):
         got, wanted = getattr(found, entry.name), getattr(read, entry.name)
         np.testing.assert_array_equal(got, wanted, entry.name)
         assert not isinstance(wanted, np.ndarray) or got.dtype == wanted.dtype
@@ -212,10 +219,13 @@ VISITS = GridVisits(
     np.array([1, -1], dtype=np.int8), np.array([0, 1], dtype=np.int8), np.array([4e-8, 5e-8]),
     9e-9, 6)
 READ = ViewReadings(
-    View("a", 0.5, (0.01, -0.02), True, False, 3), np.array([-1]), np.array([2]), np.array([3e-6]),
+    View("a", 0.5, (0.01, -0.02), True, False, 3, "x_then_y"), np.array([-1]), np.array([2]),
+    np.array([3e-6]),
     np.array([-4e-6]), np.array([5]), np.array([6e-8]), np.array([7]), np.array([-8e-3]),
-    np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15, {"low_score": 16},
-    VISITS, motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
+    np.array([9]), np.array([1e-5]), 1.1e-8, 1.2e-6, 13, 14, 15,
+    {"low_score": 16, "not_at_mark": 2}, VISITS,
+    RejectedPlaces(("not_at_mark", "low_score"), np.array([0.3, math.nan]), np.array([0.4, 0.5])),
+    motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
     motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22), axis_theta=0.01)
 MEASURED = Measurements("p", replace(PLATE, grid_pitch_m=0.01), (READ,), Sense.PLATE_MOVES,
                         {"other": 17}, "77", ("approach",))
@@ -253,6 +263,26 @@ def test_the_visits_of_a_view_survive_the_message():
     assert to_model.view_readings(old).visits is None
 
 
+def test_rejected_detections_and_the_visiting_order_survive_the_message():
+    found = to_model.view_readings(through_cdr("ViewMeasurement", from_model.view_measurement(
+        PROGRESS, MEASURED, STAMP_NS, "f")))
+    assert found.places.reason == READ.places.reason
+    np.testing.assert_array_equal([found.places.x, found.places.y],
+                                  [READ.places.x, READ.places.y])
+    assert found.view.visit_order == "x_then_y"
+
+
+@pytest.mark.parametrize("name", ["ViewCommand", "ViewMeasurement"])
+def test_a_key_of_a_plan_that_is_not_known_is_refused_by_name(name):
+    command = Command(STAMP_NS, Phase.MEASURE, "p", 3, View("a"), Artifact(5, 0.01))
+    made = from_model.command(command, "f") if name == "ViewCommand" else (
+        from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f"))
+    read = to_model.command if name == "ViewCommand" else to_model.view_readings
+    with pytest.raises(InputError, match="the key 'warm_up' of the plan is not known here; run all "
+                       "nodes in the newer version"):
+        read(through_cdr(name, {**made, "plan_keys": ["warm_up: 60"]}))
+
+
 def test_sums_over_repeats_come_back():
     message = through_cdr("ViewMeasurement", from_model.view_measurement(
         PROGRESS, MEASURED, STAMP_NS, "f"))
@@ -267,9 +297,11 @@ def test_fields_of_a_view_measurement_by_name():
     known = replace(MEASURED, artifact_from="/r.json")
     made = from_model.view_measurement(PROGRESS, known, STAMP_NS, "f")
     del made["header"]
+    np.testing.assert_array_equal(
+        [made.pop("rejected_x"), made.pop("rejected_y")], [[0.3, math.nan], [0.4, 0.5]])
     np.testing.assert_array_equal(made.pop("motion"), 1e-15 * np.arange(16.0))
     np.testing.assert_array_equal(made.pop("motion_theta"), 1e-12 * np.arange(1.0, 5.0))
-    for name in [name for name in made if name.startswith("visit_")]:
+    for name in [name for name in made if name.startswith("visit_") and name != "visit_order"]:
         del made[name]
     assert made == {
         "plan_id": "p", "view_index": 18, "view_name": "a", "rotation": 0.5, "translation_x": 0.01,
@@ -277,12 +309,14 @@ def test_fields_of_a_view_measurement_by_name():
         "grid_pitch": 0.01, "angular_count": 8, "grid_size_y": 7, "m": -1, "n": 2, "dx": 3e-6,
         "dy": -4e-6, "count": 5, "u": 6e-8, "k": 7, "dtheta": -8e-3, "count_theta": 9,
         "u_theta": 1e-5, "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "dof_xy": 13, "dof_theta": 14,
-        "detections_used": 15, "reject_reasons": ["low_score"], "reject_counts": [16],
+        "detections_used": 15,
+        "reject_reasons": ["low_score", "not_at_mark"], "reject_counts": [16, 2],
         "measurement_sense": "plate_moves", "session_reject_reasons": ["other"],
         "session_reject_counts": [17], "run_id": "77", "sigma_visit": 9e-9, "dof_visit": 6,
         "model_terms": ["approach"], "session_notes": [], "dof_motion": 21, "dof_motion_theta": 22,
         **MAP_FIELDS, **NO_IMAGE, "image_x": 0, "image_y": 0, "artifact_from": "/r.json",
-        "axis_theta": 0.01, **NO_MARKS}
+        "axis_theta": 0.01, **NO_MARKS, "rejected_reason": [1, 0], "visit_order": "x_then_y",
+        "plan_keys": []}
 
 
 def test_fields_of_a_view_status_by_name():
@@ -291,7 +325,8 @@ def test_fields_of_a_view_status_by_name():
     assert made == {
         "plan_id": "p", "view_index": 18, "view_name": "a", "grid_expected": 19, "grid_done": 20,
         "angular_expected": 21, "angular_done": 22, "detections_used": 15,
-        "detections_rejected": 16, "reject_reasons": ["low_score"], "reject_counts": [16],
+        "detections_rejected": 18,
+        "reject_reasons": ["low_score", "not_at_mark"], "reject_counts": [16, 2],
         "sigma_xy": 1.1e-8, "sigma_theta": 1.2e-6, "complete": True,
         "missing_m": [], "missing_n": [], "missing_k": [], "run_id": "", "check_expected": 4,
         "check_done": 23}
@@ -306,6 +341,8 @@ def test_fields_of_a_view_status_by_name():
     ({"u_theta": [1.0, 2.0]}, "k, dtheta, count_theta, u_theta differ in length"),
     ({"reject_counts": []}, "reject_reasons and reject_counts differ in length"),
     ({"visit_dy": [1.0]}, "the visits differ in length or name marks that were not read"),
+    ({"rejected_y": [1.0]}, "the rejected detections differ in length or name no reason"),
+    ({"rejected_reason": [0, 2]}, "the rejected detections differ in length or name no reason"),
     ({"motion": [1.0, 2.0]}, "motion has 2 values, not 16"),
     ({"motion_theta": [1.0]}, "motion_theta has 1 values, not 4"),
     ({"visit_mark": [0, 1]}, "the visits differ in length or name marks that were not read")])

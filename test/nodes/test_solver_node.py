@@ -2,7 +2,6 @@
 """solver: maps from readings, the services, and a plan that does not identify the stage."""
 
 import json
-import re
 import threading
 from dataclasses import replace
 from functools import cache
@@ -26,6 +25,7 @@ from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill, map_geometry
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
+from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.compensating import read_result
 from selfcal_ros.sessions.solving import Outcome
@@ -85,18 +85,10 @@ def test_the_map_is_that_of_the_readings_bit_for_bit(solve, graph):
     assert last.max_error_um == pytest.approx(norm.max() * 1e6, rel=1e-12)
 
 
-def test_the_state_is_a_sentence_that_topic_echo_shows_whole(solve):
-    _, summaries, _ = solve()
-    assert summaries[-1].state.startswith("Calibrated from 4 views: largest error ")
-    assert re.search(r"\(k=2(\.\d+)?\)\.$", summaries[-1].state)
+def test_the_state_is_a_line_that_topic_echo_shows_whole(solve):
+    _, summaries, measurements = solve()
+    assert summaries[-1].state == state_line(worded(calibrate(measurements)))
     assert len(summaries[-1].state) <= 128
-
-
-@pytest.mark.parametrize("sentence, shown", [
-    ("Short.", "Short."), ("a" * 100 + "; " + "b" * 40 + ".", "a" * 100 + "."),
-    ("a" * 60 + ", b; " + "c" * 80, "a" * 60 + ", b."), ("a" * 200, "a" * 127 + ".")])
-def test_a_long_sentence_ends_with_a_clause(sentence, shown):
-    assert from_model.short(sentence) == shown
 
 
 def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):

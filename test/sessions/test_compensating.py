@@ -31,7 +31,8 @@ def map_of(error_map=ONE, stamp_ns: int = START_NS, **changes) -> object:
 def summary_of(stamp_ns: int = START_NS, **changes) -> object:
     numbers = dict.fromkeys(
         ("max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
-         "rms_theta_uncertainty_arcsec"), 0.0)
+         "rms_theta_uncertainty_arcsec", "rms_uncertainty_anywhere_um",
+         "max_uncertainty_anywhere_um"), 0.0)
     return message("CalibrationSummary", {
         "header": from_model.header(stamp_ns, "stage"), "state": "as it is", "views_done": 4,
         "views_planned": 4, "identifiable": True, "rank_deficiency": 0, "advice": [],

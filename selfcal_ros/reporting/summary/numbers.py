@@ -11,6 +11,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ErrorMap, datum_modes, remove_modes, rms
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M, URAD_PER_RAD
@@ -204,18 +205,30 @@ def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
     """Return the numbers of a CalibrationSummary message by the names of its fields.
 
     Lengths in um, angles in arcsec, NaN where unknown, as all are without a result.
-    ``max_error_um`` is the longest error vector |G|, ``rms_error_um`` and ``rms_uncertainty_um``
-    (k=1) are per axis.
+    ``max_error_um`` is the longest error vector |G|, ``rms_error_um`` and the uncertainties (k=1)
+    are per axis; those with ``anywhere`` include the interpolation between the nodes.
     """
     if result is None:
-        return dict.fromkeys(("max_error_um", "rms_error_um", "rms_uncertainty_um",
-                              "max_theta_error_arcsec", "rms_theta_uncertainty_arcsec"), math.nan)
-    figures = map_figures(result.error_map)
+        return dict.fromkeys(_SUMMARY_FIELDS, math.nan)
+    figures, between = map_figures(result.error_map), budget_anywhere(result)
     return {"max_error_um": figures.max_error_m * UM_PER_M,
             "rms_error_um": figures.rms_error_m * UM_PER_M,
             "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
             "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
-            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD}
+            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD,
+            "rms_uncertainty_anywhere_um": (between.u_rms if between else math.nan) * UM_PER_M,
+            "max_uncertainty_anywhere_um": (between.u_max if between else math.nan) * UM_PER_M}
+
+
+def budget_anywhere(result: CalibrationResult) -> Budget | None:
+    """Return the budget of a coordinate anywhere in the field; None without an uncertainty map."""
+    found = (budget for budget in budgets(result) if budget.quantity == "xy" and budget.anywhere)
+    return next(found, None)
+
+
+_SUMMARY_FIELDS = (
+    "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
+    "rms_theta_uncertainty_arcsec", "rms_uncertainty_anywhere_um", "max_uncertainty_anywhere_um")
 
 
 def map_figures(emap: ErrorMap) -> MapFigures:

@@ -22,6 +22,7 @@ from selfcal_ros.reporting.summary.numbers import (
     aligned,
     aligned_numbers,
     arcsec,
+    budget_anywhere,
     camera_facts,
     counted,
     decimals_for,
@@ -343,6 +344,35 @@ def state_sentence(result: CalibrationResult) -> str:
         return f"{result.verdict.sentence}. {text}" if "recheck" in result.extra else text
     said = printable(result.verdict.sentence).rstrip(".")
     return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
+
+
+def state_line(result: CalibrationResult) -> str:
+    """Return grade, error and U in one line; its figures fit what `ros2 topic echo` shows.
+
+    It shows 128 characters. The reason of a grade below good follows.
+    """
+    figures, between = map_figures(result.error_map), budget_anywhere(result)
+    verdict = result.verdict
+    if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
+        return state_sentence(result)
+
+    parts = []
+    if figures.n_known:
+        parts.append(f"error up to {um(figures.max_error_m)}")
+        parts.append(f"U {um(result.noise.k_xy * figures.max_u_m)} at the nodes")
+        parts.append(f"{um(between.U_max if between else math.nan)} anywhere")
+    line = ", ".join(parts)
+    if figures.n_lines_known:
+        u_theta = arcsec(result.noise.k_theta * figures.max_u_theta_rad)
+        line += f"{'; ' * bool(parts)}θ up to {arcsec(figures.max_theta_rad)}, U {u_theta}"
+
+    if "recheck" in result.extra and verdict.qualified:
+        return f"{verdict.sentence}: {line}."
+    if verdict.grade is Grade.GOOD:
+        return f"Good: {line}."
+    lead = "Good within an enlarged U" if verdict.qualified else "Not qualified"
+    reasons = [f"most likely {cause.text}" for cause in verdict.causes] or verdict.reasons
+    return f"{lead}: {'; '.join((line, *map(printable, reasons[:1])))}."
 
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:

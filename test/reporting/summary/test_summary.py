@@ -13,12 +13,14 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Grade, ModelResult, TermEstimate, TermResult, Verdict
 from selfcal_ros.reporting.summary.numbers import (
     aligned,
+    arcsec,
     can_print_symbols,
     fixed_column,
     map_figures,
@@ -26,10 +28,12 @@ from selfcal_ros.reporting.summary.numbers import (
     summary_numbers,
     to_ascii,
     truth_figures,
+    um,
 )
 from selfcal_ros.reporting.summary.sections import (
     place_text,
     pose_text,
+    state_line,
     state_sentence,
     summary_text,
 )
@@ -65,6 +69,11 @@ def test_numbers_of_a_map_by_hand():
     assert numbers["rms_uncertainty_um"] == pytest.approx(0.02, rel=1e-14)
     assert numbers["max_theta_error_arcsec"] == pytest.approx(2.0, rel=1e-14)
     assert numbers["rms_theta_uncertainty_arcsec"] == pytest.approx(0.5, rel=1e-14)
+    node, between = (next(budget for budget in budgets(result) if budget.quantity == "xy"
+                          and budget.anywhere is wanted) for wanted in (False, True))
+    assert numbers["rms_uncertainty_anywhere_um"] == pytest.approx(between.u_rms * 1e6, rel=1e-14)
+    assert numbers["max_uncertainty_anywhere_um"] == pytest.approx(between.u_max * 1e6, rel=1e-14)
+    assert between.u_max > 10 * node.u_max  # a map of one peak is rough between its sites
     assert map_figures(emap).max_site == (1, -1)
     assert place_text(emap, (1, -1)) == "at x 10 mm, y -10 mm (site 1, -1)"
     assert "at x 10 mm, y -10 mm (site 1, -1)" in line_with(summary_text(result), "largest error")
@@ -92,6 +101,31 @@ def test_state_sentence_says_what_was_found():
     assert sentence.startswith("Calibrated from 4 views: largest error 0.")
     assert "every site known to ±0.0" in sentence and sentence.endswith("arcsec.")
     assert state_sentence(replace(result, warnings=("a", "b"))).endswith("; 2 warnings.")
+
+
+def test_the_line_of_the_topic_has_grade_error_and_each_u_and_is_shown_whole():
+    result, _ = known_result()
+    emap, noise = result.error_map, result.noise
+    line, u = state_line(result), np.stack([emap.u_gx, emap.u_gy])
+    anywhere = next(b for b in budgets(result) if b.quantity == "xy" and b.anywhere)
+    assert line == (
+        f"Good: error up to {um(np.hypot(emap.gx, emap.gy).max())}, U {um(noise.k_xy * u.max())} "
+        f"at the nodes, {um(anywhere.U_max)} anywhere; θ up to {arcsec(abs(emap.g_theta).max())}, "
+        f"U {arcsec(noise.k_theta * emap.u_g_theta.max())}.")
+    assert len(line) <= 128
+    cause = Cause("slip", text="view 'a' slipped: measure it again")
+    for verdict, lead, reason in (
+            (Verdict(Grade.NOT_QUALIFIED, causes=(cause,)), "Not qualified: ",
+             "; most likely view 'a' slipped: measure it again."),
+            (Verdict(Grade.ENLARGED, reasons=("too rough",)), "Good within an enlarged U: ",
+             "; too rough.")):
+        graded = state_line(replace(result, verdict=verdict))
+        assert graded == lead + line.removeprefix("Good: ").removesuffix(".") + reason
+        assert len(graded) - len(reason) <= 128
+    without = replace(result, error_map=replace(emap, gx=emap.gx * np.nan))
+    assert state_line(without).startswith("Good: θ up to ")
+    unseen = replace(result, observability=UNSEEN)
+    assert state_line(unseen) == state_sentence(unseen)
 
 
 def test_state_sentence_of_a_deficient_plan_names_the_missing_view():
