@@ -134,12 +134,31 @@ def _fed(reader: BagReader, settings: CollectorSettings, roles: Collection[str],
     return reader, collector
 
 
-def clock_lines(path: str | Path, settings: CollectorSettings,
-                namespace: str | None = None) -> tuple[list[str], dict[str, int]]:
-    """Return a line for each clock step, and refused messages by reason, like `collect_bag`."""
+class BagLines(NamedTuple):
+    """What the nodes that a bag is played into cannot see of it, as in `BagSession`.
+
+    Attributes
+    ----------
+    lost : list of str
+        Unreadable parts and unusable commands, one line each.
+    clock : list of str
+        Clock steps, one line each.
+    refused : dict
+        Reason -> number of refused messages.
+    """
+
+    lost: list[str]
+    clock: list[str]
+    refused: dict[str, int]
+
+
+def bag_lines(path: str | Path, settings: CollectorSettings,
+              namespace: str | None = None) -> BagLines:
+    """Return the problems of a bag, like `collect_bag`."""
     reader = BagReader(Path(path), namespace, settings.clock_limit)
     reader, collector = _fed(reader, settings, [COMMAND_TOPIC])
-    return step_lines(reader.steps, collector.timeline), collector.unusable
+    clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
+    return BagLines(reader.lost, clock, collector.unusable)
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:

@@ -8,8 +8,9 @@ import sys
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
-from selfcal_ros.bagio.offline import Playlist, bag_input, clock_lines
+from selfcal_ros.bagio.offline import BagLines, Playlist, bag_input, bag_lines
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
 from selfcal_ros.cli.terminal import (
     add_json,
@@ -28,7 +29,7 @@ from selfcal_ros.collection.settings.detector import OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_yaml
-from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
+from selfcal_ros.model.result import result_from_dict
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
 AS_RECORDED = -1
@@ -67,22 +68,25 @@ def run(args: argparse.Namespace) -> int:
                          f"give a number from 0 to {LARGEST_SEED}")
     check_outputs([args.bag, args.params], [file_of(args)])
     source, detector = bag_input(args.bag), detector_of(args)
+    settings = node_settings(args.params, CollectorSettings)
     with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
           domain() as environment):
         saved = folder / "result.json"
-        code, lost = _play(args, saved, environment, detector)
-        clock, refused = _clock_lines(args)
-        if code or not saved.exists():
+        code, unplayed = _play(args, saved, environment, detector)
+        bag = bag_lines(args.bag, settings, args.namespace)
+        for line in (*bag.lost, *bag.clock):
+            if line not in unplayed:
+                print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+        if not saved.exists():
             return code or 1
-        result = result_from_dict(read_json(saved), str(saved))
-        noted = [line for line in clock if line not in result.warnings]
-        result = with_input(result, source, [*lost, *noted])
-        result = replace(result, rejected=dict(sorted((result.rejected | refused).items())))
-    data = result_to_dict(result)
+        data = with_bag(read_json(saved), bag, unplayed) | {"input": source}
     if file_of(args):
         write_json(args.output, data)
     if on_stdout(args):
         put(data)
+    if code:  # a result without a map
+        return code
+    result = result_from_dict(data, args.bag)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
@@ -112,16 +116,26 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
                    autostart=way.autostart)
 
 
-def _clock_lines(args: argparse.Namespace) -> tuple[list[str], dict[str, int]]:
-    """Print and return the clock steps in the bag, which no node can detect during fast replay.
+def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str]) -> dict[str, Any]:
+    """Return the JSON form of a result with what the nodes could not see of the bag.
 
-    Also return the counts of messages stamped in the future, which were not played, by reason.
+    No node can detect clock steps during fast replay, and messages stamped in the future were not
+    played.
+
+    Parameters
+    ----------
+    data : dict
+        RESULT.json as the solver wrote it.
+    bag : BagLines
+        Problems of the bag.
+    unplayed : list of str
+        What could not be played, one line each.
     """
-    settings = node_settings(args.params, CollectorSettings)
-    lines, refused = clock_lines(args.bag, settings, args.namespace)
-    for line in lines:
-        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
-    return lines, refused
+    beside = [line for line in unplayed if line not in (*bag.lost, *bag.clock)]
+    known = [*bag.lost, *beside, *bag.clock]
+    of_nodes = [line for line in data["warnings"] if line not in known]
+    return data | {"warnings": [*of_nodes, *known],
+                   "rejected": dict(sorted((data["rejected"] | bag.refused).items()))}
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict,

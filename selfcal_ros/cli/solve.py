@@ -174,8 +174,10 @@ def run(args: argparse.Namespace) -> int:
             result = _calibrated(args, measurements, options)
     except NotIdentifiableError as error:
         if (args.output or args.json) and error.observability is not None:
-            result = worded(unidentified_result(measurements, error.observability))
-            _write(args, result_to_dict(with_input(result, bag_input(args.bag), lost)))
+            result = unidentified_result(measurements, error.observability)
+            result = worded(with_places(result, measurements.views))
+            _write(args, result_to_dict(created_now(
+                with_input(result, bag_input(args.bag), lost))))
         if findings:  # missing readings look like a deficient plan
             raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
                                        error.observability) from error

@@ -13,14 +13,13 @@ from selfcal_msgs.srv import SaveMap
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from selfcal_ros.bagio.offline import Playlist, bag_input
+from selfcal_ros.bagio.offline import Playlist, bag_input, bag_lines
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
-from selfcal_ros.model.result import result_from_dict, result_to_dict, with_input
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player
@@ -32,6 +31,7 @@ from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
 from test.support.mark_lists import listed_plan
 from test.support.plans import image_plan, placed_plan
+from test.support.ports import settings_of
 from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
 
 
@@ -41,15 +41,28 @@ def undated(text: str) -> str:
     return re.sub('"created": "[^"]*"', '"created": ""', text)
 
 
-@pytest.fixture(scope="module", params=[None, placed_plan(count=8, repeats=2),
+REJECTED = {"low_score": 0.05, "unknown_mark": 0.05, "outliers": 0.05}
+"""Parts of the detections of the first bag that are rejected."""
+
+
+def ordered_plan():
+    """Return a plan that states in which order its marks are visited."""
+    plan = small_plan(repeats=4)
+    return replace(plan, views=tuple(replace(view, visit_order="x_back_y_back@plate")
+                                     for view in plan.views))
+
+
+@pytest.fixture(scope="module", params=[ordered_plan(), placed_plan(count=8, repeats=2),
                                         image_plan(5, count=8, repeats=2), listed_plan(),
                                         image_plan(6, count=8, repeats=2)],
                 ids=["on the lattice", "placed", "images", "a list of marks", "even sides"])
 def solved(request, tmp_path_factory):
     """Return a bag and the text of the result that `selfcal solve` writes for it."""
     folder = tmp_path_factory.mktemp("replay")
-    bag = small_bag(folder, request.param)
+    ordered = bool(request.param.views[0].visit_order)
+    bag = small_bag(folder, request.param, **REJECTED if ordered else {})
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) in (0, 5)
+    assert ("rejected_at" in read_json(folder / "solved.json")) is ordered
     return bag, undated((folder / "solved.json").read_text())
 
 
@@ -74,12 +87,12 @@ def played(graph, bag, folder, *, rate=0.0, seed=-1, cell=None):
     return session
 
 
-def result_text(session, bag, folder):
+def result_text(session, bag, folder, cell=None):
     """Return the text of the result that the command would write."""
-    saved = folder / "saved.json"
-    result = with_input(result_from_dict(read_json(saved), str(saved)), bag_input(str(bag)),
-                        session.player.playlist.lost)
-    write_json(folder / "replayed.json", result_to_dict(result))
+    of_bag = bag_lines(bag, settings_of("measurement_collector"), cell)
+    data = replay_verb.with_bag(read_json(folder / "saved.json"), of_bag,
+                                session.player.playlist.lost)
+    write_json(folder / "replayed.json", data | {"input": bag_input(str(bag))})
     return undated((folder / "replayed.json").read_text())
 
 
@@ -103,7 +116,7 @@ def test_one_of_two_cells_is_played(graph, two_cells, tmp_path, cell):
     session = played(graph, two_cells, tmp_path, cell=cell)
     assert selfcal(["solve", str(two_cells), "--namespace", cell, "--quiet", "-o",
                     str(tmp_path / "solved.json")]) == 0
-    assert result_text(session, two_cells, tmp_path) == undated(
+    assert result_text(session, two_cells, tmp_path, cell) == undated(
         (tmp_path / "solved.json").read_text())
 
 
@@ -148,14 +161,17 @@ def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
     assert f"result_folder:={Path(saved).parent}" in started["solver"]
 
 
-def test_a_deficient_bag_ends_with_code_3_and_says_why(graph, tmp_path, capfd):
+def test_a_deficient_bag_ends_with_code_3_and_the_result_of_solve(graph, tmp_path, capfd):
     """The session's code is that of the command, as another test has it."""
-    bag = small_bag(tmp_path, small_plan("0, 90"))
-    assert played(graph, bag, tmp_path).exit_code == 3
+    bag = small_bag(tmp_path, small_plan("0, 90"), low_score=0.05)
+    session = played(graph, bag, tmp_path)
+    assert session.exit_code == 3
     [line] = [text for text in capfd.readouterr().err.splitlines() if "selfcal replay: " in text]
-    assert selfcal(["solve", str(bag), "--quiet"]) == 3
+    solved = tmp_path / "solved.json"
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(solved)]) == 3
     [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
     assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
+    assert result_text(session, bag, tmp_path) == undated(solved.read_text())
 
 
 @pytest.mark.parametrize("noted", [False, True], ids=["played fast", "in real time"])
