@@ -10,7 +10,7 @@ import numpy as np
 
 from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
 from selfcal_ros.cli.terminal import add_json, say
-from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
@@ -46,9 +46,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Follow the marks, print the camera, write the parameters."""
-    detector = ImageDetector(DetectorSettings.checked({
+    settings = DetectorSettings.checked({  # offsets in pixels
         "pixel_size": 1.0, "mark_size": float(args.mark_pixels), "mark": args.mark,
-        "polarity": args.polarity}, "--mark-pixels"), "--mark-pixels")  # offsets in pixels
+        "polarity": args.polarity, "max_marks": ANY_NUMBER}, "--mark-pixels")
+    detector = ImageDetector(settings, "--mark-pixels")
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
     counts = detector.counts
     if counts.empty:

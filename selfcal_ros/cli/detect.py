@@ -4,12 +4,13 @@
 import argparse
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
-from selfcal_ros.collection.settings.detector import OPTIONS, DetectorSettings
+from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
@@ -40,7 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    settings = node_settings(args.params, DetectorSettings, **given(args, OPTIONS))
+    settings = replace(node_settings(args.params, DetectorSettings, **given(args, OPTIONS)),
+                       max_marks=ANY_NUMBER)
     detector = ImageDetector(settings, args.params or "options")
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)
@@ -73,7 +75,8 @@ def text_of(output: str, found: dict[str, int]) -> str:
     rejected = ", ".join(f"{count} {name.removeprefix('rejected_')}"
                          for name, count in found.items() if name.startswith("rejected_"))
     more = [f"{found[name]} {text}" for name, text in (
-        ("images_without_marks", "images without marks"), ("images_refused", "images refused"))
-        if found[name]]
+        ("images_without_marks", "images without marks"), ("images_refused", "images refused"),
+        ("images_with_more_pages", "images with further pages, which were not used"))
+        if found.get(name)]
     return "; ".join([f"{output}: {found['marks']} marks in {found['images']} images",
                       *([f"rejected: {rejected}"] if rejected else []), *more])

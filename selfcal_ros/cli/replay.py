@@ -25,7 +25,7 @@ from selfcal_ros.cli.terminal import (
     put,
     show,
 )
-from selfcal_ros.collection.settings.detector import OPTIONS, DetectorSettings
+from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_yaml
@@ -113,7 +113,7 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
     MarkDetector(settings, f"{args.bag} has images and no detections: {args.params or 'options'}")
     way = DetectorSettings(transport=transport)  # how images reach it is not the user's here
     return replace(settings, transport=transport, max_waiting=way.max_waiting,
-                   autostart=way.autostart)
+                   max_marks=ANY_NUMBER, autostart=way.autostart)
 
 
 def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str]) -> dict[str, Any]:

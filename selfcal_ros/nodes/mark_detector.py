@@ -15,6 +15,7 @@ from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.detecting import DetectingSession
+from selfcal_ros.topics import IMAGE_TOPICS
 
 TICK_S = 0.2
 """Period of counting lost images."""
@@ -37,6 +38,7 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         self._detections = self.publisher(names.DETECTIONS)
         self._received = self.publisher(names.private(names.RECEIVED))
         self._taken = self._found = self._matched = 0
+        self.alone_on.append(IMAGE_TOPICS[self.settings.transport])
         self.session = DetectingSession(self.settings, self.ports(self._publish))
 
     def activate(self) -> None:

@@ -103,12 +103,19 @@ class MarkDetector:
         self._sign = 0 if settings.mark == "corner" else 1 if settings.polarity == "bright" else -1
 
     def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
-        """Return the marks of an image, row by row, and the number of rejected ones by reason."""
+        """Return the marks of an image, row by row, and the number of rejected ones by reason.
+
+        Raises
+        ------
+        InputError
+            If there are more possible marks than `max_marks`.
+        """
         image, full = picture.values, self.settings.full_scale or picture.full_scale
         found: list[Mark] = []
         faults: Counter[str] = Counter()
         for candidate in candidates(image, mark=self.settings.mark, size=self.size,
-                                    width=self._width, sign=self._sign):
+                                    width=self._width, sign=self._sign,
+                                    most=self.settings.max_marks):
             mark = self._mark(image, candidate, full)
             if isinstance(mark, Mark) and any(
                     np.hypot(mark.u - other.u, mark.v - other.v) < SAME * self.size

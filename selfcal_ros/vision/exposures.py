@@ -4,17 +4,18 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.detector import MarkDetector
-from selfcal_ros.vision.images import Picture, decoded, picture_of
+from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 
 SETTLED = 3
-"""Consecutive images that fix the size for all."""
+"""Consecutive images that fix the camera and the size for all."""
 
 MOST_STAMPS = 100_000
 """Most stamps that are kept to refuse repeated images: an hour of 30 a second."""
@@ -30,6 +31,8 @@ class Counts:
         Images that were used, and those of them without any mark.
     refused : int
         Images that could not be used.
+    paged : int
+        Images whose file has further pages, which were not used.
     marks : int
         Detections.
     rejected : Counter
@@ -39,6 +42,7 @@ class Counts:
     images: int = 0
     empty: int = 0
     refused: int = 0
+    paged: int = 0
     marks: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
 
@@ -46,6 +50,7 @@ class Counts:
         """Return name -> number, the reasons last."""
         return {"images": self.images, "images_refused": self.refused,
                 "images_without_marks": self.empty, "marks": self.marks,
+                **({"images_with_more_pages": self.paged} if self.paged else {}),
                 **{f"rejected_{name}": count for name, count in sorted(self.rejected.items())}}
 
 
@@ -63,7 +68,7 @@ class ImageDetector:
     def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
         self._detector = MarkDetector(settings, where)
         self.counts = Counts()
-        self._size = _Size()
+        self._source = _Source()
         self._stamps: dict[int, None] = {}  # of the images used, in their order
 
     def take(self, message: Any) -> list[Detection]:
@@ -72,68 +77,85 @@ class ImageDetector:
         Raises
         ------
         InputError
-            If the image cannot be used, which is counted: unknown encoding, damaged, another size,
-            the stamp of an earlier image.
+            If the image cannot be used, which is counted: unknown encoding, damaged, of another
+            camera or size, the stamp of an earlier image, more possible marks than `max_marks`.
         """
-        return self._detect(lambda: picture_of(message), stamp_ns(message), "image")
+        return self._detect(partial(picture_of, message), stamp_ns(message), "image",
+                            camera=str(message.header.frame_id))
 
     def take_file(self, data: bytes, name: str, stamp: int) -> list[Detection]:
         """Return the detections of an image file exposed at `stamp`, ns; raises like `take`."""
-        return self._detect(lambda: decoded(data, name), stamp, name)
+        return self._detect(partial(decoded, data, name), stamp, name)
 
-    def _detect(self, decode: Callable[[], Picture], stamp: int, name: str) -> list[Detection]:
+    def _detect(self, decode: Callable[[Check], Picture], stamp: int, name: str, *,
+                camera: str = "") -> list[Detection]:
         try:
-            picture = decode()
-            self._check(stamp, picture, name)
+            if stamp in self._stamps:
+                raise InputError(name, "its stamp is that of an earlier image",
+                                 "stamp each exposure by its own instant")
+            picture = decode(lambda shape: self._refuse_other((camera, *shape), name))
+            if not self._source.agrees(seen := (camera, *picture.values.shape)):
+                raise other_source(self._source.image, seen, name)
+            found, rejected = self._detector.detections(picture, stamp)
         except InputError:
             self.counts.refused += 1
             raise
         self._stamps[stamp] = None
         if len(self._stamps) > MOST_STAMPS:
             del self._stamps[next(iter(self._stamps))]
-        found, rejected = self._detector.detections(picture, stamp)
+        self.counts.paged += picture.more_pages
         self.counts.images += 1
         self.counts.empty += not found
         self.counts.marks += len(found)
         self.counts.rejected.update(rejected)
         return found
 
-    def _check(self, stamp: int, picture: Picture, name: str) -> None:
-        """Refuse a repeated image, and one of another size, whose centre is not the axis.
+    def _refuse_other(self, image: tuple, name: str) -> None:
+        """Refuse an image of another camera or size than the settled one, before it is decoded.
 
         Stamps need not ascend: a single one in the future, or a clock that was set back, spoils no
         other image. Which of them count, the collector judges.
         """
-        if stamp in self._stamps:
-            raise InputError(name, "its stamp is that of an earlier image",
-                             "stamp each exposure by its own instant")
-        shape = picture.values.shape
-        if not self._size.agrees(shape):
-            old, new = (f"{size[1]} x {size[0]}" for size in (self._size.shape, shape))
-            raise InputError(name, f"{new} pixels, but earlier images have {old}",
-                             "record images of one size; the optical axis is their centre")
+        if self._source.settled and image != self._source.image:
+            raise other_source(self._source.image, image, name)
+
+
+def other_source(image: tuple, other: tuple, name: str) -> InputError:
+    """Return the error that an image is of another camera, or of another size.
+
+    Its centre would not be the optical axis of the others.
+    """
+    if image[0] != other[0]:
+        return InputError(name, f"of the camera '{printable(other[0])}', earlier ones are of "
+                          f"'{printable(image[0])}' (frame_id)",
+                          "remap one of the two: a mark_detector has one camera")
+    old, new = (f"{width} x {height}" for _, height, width in (image, other))
+    return InputError(name, f"{new} pixels, but earlier images have {old}",
+                      "record images of one size; the optical axis is their centre")
 
 
 @dataclass
-class _Size:
-    """The size of the images: that of the first one, unless it was an odd one."""
+class _Source:
+    """Camera, height and width of the images: those of the first one, unless it was an odd one."""
 
-    shape: tuple[int, ...] = ()
+    image: tuple = ()
     used: int = 0
-    other: tuple[int, ...] = ()
+    other: tuple = ()
     alike: int = 0
 
-    def agrees(self, shape: tuple[int, ...]) -> bool:
-        """Take the size of an image; return whether it is that of the images.
+    @property
+    def settled(self) -> bool:
+        """Whether the first `SETTLED` images in a row of one kind have settled it."""
+        return self.used >= SETTLED
 
-        The first `SETTLED` images in a row of one size settle it.
-        """
-        self.shape = self.shape or shape
-        if shape != self.shape:
-            self.alike = self.alike + 1 if shape == self.other else 1
-            self.other = shape
-            if self.used >= SETTLED or self.alike < SETTLED:
+    def agrees(self, image: tuple) -> bool:
+        """Take the camera and the size of an image; return whether they are those of the images."""
+        self.image = self.image or image
+        if image != self.image:
+            self.alike = self.alike + 1 if image == self.other else 1
+            self.other = image
+            if self.settled or self.alike < SETTLED:
                 return False
-            self.shape, self.used = shape, self.alike - 1
+            self.image, self.used = image, self.alike - 1
         self.used, self.alike = self.used + 1, 0
         return True

@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import fft
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.vision.models import MODELS
 
 REDUCED_SIZE = 8
@@ -19,6 +20,8 @@ QUANTUM = 0.3
 """Standard deviation of rounding to grey values, at least that of noise."""
 FAINT = 0.05
 """Smallest amplitude of a candidate relative to the largest one."""
+PEAKS = 10
+"""Largest number of peaks of the correlation, over that of candidates: each takes some time."""
 ANGLES = 6
 """Number of templates over the turns of a mark."""
 MARGIN, APART = 0.7, 0.6
@@ -96,7 +99,7 @@ def _reflected(image: np.ndarray, half: int) -> np.ndarray:
 
 
 def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign: int,
-               ) -> list[Candidate]:
+               most: int) -> list[Candidate]:
     """Return the candidates for marks, row by row.
 
     Parameters
@@ -109,6 +112,13 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
         Its size and the width of its lines, px.
     sign : int
         1 for marks brighter than the ground, -1 for darker ones, 0 for both.
+    most : int
+        Largest number of candidates.
+
+    Raises
+    ------
+    InputError
+        If there are more.
     """
     factor = max(1, int(size / REDUCED_SIZE))
     half = _half(size / factor)
@@ -122,13 +132,17 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
         half:half + small.shape[0], half:half + small.shape[1]]
     amplitude = max(NOISES * max(_noise(small), QUANTUM / factor), FAINT * float(best.max()))
     peaks = (best > amplitude) & (best == _largest(best, round(APART * size / factor)))
-    found_at = []
+    if np.count_nonzero(peaks) > PEAKS * most:
+        raise too_many(most)
+    found_at: list[Candidate] = []
     for row, column in zip(*np.nonzero(peaks), strict=True):
         square = padded[row:row + 2 * half + 1, column:column + 2 * half + 1].astype(float)
         norm = square.size ** 0.5 * max(float(square.std()), 1e-3)
         correlation = float(best[row, column]) / norm
         if correlation <= CORRELATION:
             continue
+        if len(found_at) == most:
+            raise too_many(most)
         near = [float(np.vdot(template.square, square)) for template in templates]
         which = int(np.argmax(np.abs(near) if sign == 0 else near))
         finer = (float(column) + _vertex(best[row, :], column),
@@ -137,6 +151,12 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
             round((finer[0] + 0.5) * factor - 0.5), round((finer[1] + 0.5) * factor - 0.5),
             templates[which].angle, correlation))
     return found_at
+
+
+def too_many(most: int) -> InputError:
+    """Return the error that an image shows more possible marks than `most`."""
+    return InputError("image", f"more than {most} possible marks",
+                      "check mark_size and pixel_size, or set max_marks")
 
 
 def _correlated(padded: np.ndarray, templates: list[_Template], sign: int) -> np.ndarray:

@@ -25,8 +25,8 @@ def desk():
     return SimpleNamespace(session=session, sent=sent)
 
 
-def image(stamp, values):
-    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=5))
+def image(stamp, values, camera="eye"):
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=5), frame_id=camera)
     return SimpleNamespace(header=header, height=values.shape[0], width=values.shape[1],
                            encoding="mono8", is_bigendian=0, step=values.shape[1],
                            data=values.tobytes())
@@ -100,3 +100,48 @@ def test_an_odd_first_image_does_not_define_the_size(desk):
     sizes = [70, 80, 80, 70, 80, 80, 80, 80, 70, 70, 70, 70, 80]
     images = [image(number, drawn()[:rows]) for number, rows in enumerate(sizes)]
     assert refused(desk, images) == [1, 2, 4, 5, 8, 9, 10, 11]
+
+
+def test_another_camera_on_the_topic_is_named_and_its_images_refused(desk):
+    desk.session.take(image(1, drawn()))
+    for stamp in (2, 4, 6):
+        desk.session.take(image(stamp, drawn()))
+        with pytest.raises(InputError, match="of the camera 'hand', earlier ones are of 'eye'"):
+            desk.session.take(image(stamp + 1, drawn(), "hand"))
+    assert len(desk.sent) == 4
+
+
+def test_of_a_settled_size_another_one_is_refused_before_it_is_decoded(desk):
+    for stamp in range(exposures.SETTLED):
+        desk.session.take(image(stamp, drawn()))
+    other = image(9, drawn()[:60])
+    other.data = Unreadable(60 * 90)
+    with pytest.raises(InputError, match="90 x 60 pixels, but earlier images have 90 x 80"):
+        desk.session.take(other)
+
+
+class Unreadable(bytes):
+    """Data with a length that fails the test if its values are used."""
+
+    def __new__(cls, length):
+        return super().__new__(cls, length)
+
+    def __buffer__(self, flags):
+        pytest.fail("decoded")
+
+
+def test_more_possible_marks_than_max_marks_refuse_the_image(desk):
+    """Found before any of them is fitted."""
+    grid = np.stack(np.meshgrid([-1e-4, 0.0, 1e-4], [-5e-5, 5e-5])).reshape(2, -1)
+    values = Camera(width=190, height=150).image(grid, np.random.default_rng(1))
+    for most, marks in ((6, 6), (5, None)):
+        session = DetectingSession(DetectorSettings(
+            pixel_size=2e-6, mark_size=5e-5, max_marks=most), SimpleNamespace(
+            publish=lambda *given: desk.sent.append(given)))
+        if marks:
+            session.take(image(1, values))
+            assert len(desk.sent) == marks
+            continue
+        with pytest.raises(InputError, match="more than 5 possible marks; check mark_size"):
+            session.take(image(1, values))
+        assert session.diagnosis().values["images_refused"] == 1

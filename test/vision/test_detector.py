@@ -108,7 +108,7 @@ def test_a_large_mark_sought_in_a_reduced_image_is_found_to_the_pixel():
     cell = camera(size=100.0, width=401, height=381)
     for away in np.array([(0.0, 0.0), (3.1, 4.9), (-4.2, 2.3), (5.8, -1.6)]) * PIXEL:
         image = cell.image(away[:, None], np.random.default_rng(1))
-        [found] = candidates(image, mark="disc", size=100.0, width=20.0, sign=-1)
+        [found] = candidates(image, mark="disc", size=100.0, width=20.0, sign=-1, most=9)
         true = cell.pixels_of(away[:, None])[:, 0]
         assert np.abs(np.subtract((found.column, found.row), true)).max() <= 1
 

@@ -2,11 +2,13 @@
 """Pixels of messages and of encoded images; what is damaged is refused in one line."""
 
 import io
+import os
+import subprocess
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.vision.images import decoded, picture_of
@@ -23,7 +25,7 @@ GREY = np.arange(12, dtype=np.uint8).reshape(3, 4)
 
 @pytest.mark.parametrize("kind, encoding", [("u1", "mono8"), ("<u2", "mono16")])
 def test_grey_images(kind, encoding):
-    values, full = picture_of(message((GREY * 20).astype(kind), encoding))
+    values, full, _ = picture_of(message((GREY * 20).astype(kind), encoding))
     assert (values == GREY * 20).all() and values.dtype == np.dtype(kind)
     assert full == (255 if kind == "u1" else 65535)
 
@@ -39,7 +41,7 @@ def test_the_order_of_bytes_and_padded_rows_are_obeyed():
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8"])
 def test_colours_are_summed(encoding):
     colours = np.stack([GREY, GREY + 100, GREY + 200], axis=2)
-    values, full = picture_of(message(colours, encoding))
+    values, full, _ = picture_of(message(colours, encoding))
     assert (values == colours.sum(axis=2)).all() and full == 765
 
 
@@ -76,3 +78,58 @@ def test_a_grey_value_of_16_bits_needs_two_bytes():
 def test_what_cannot_be_decoded_is_refused(data):
     with pytest.raises(InputError, match=r"^f\.png: not an image, or damaged; give PNG"):
         decoded(data, "f.png")
+
+
+EPS = (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\n"
+       b"0 setgray 20 20 60 60 rectfill showpage\n%%EOF\n")
+
+
+def test_no_format_is_decoded_that_needs_a_program(monkeypatch):
+    def run(*_, **__):
+        pytest.fail("a program was started")
+    monkeypatch.setattr(subprocess, "Popen", run)
+    monkeypatch.setattr(os, "system", run)
+    assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (100, 100)  # Pillow would take it
+    with pytest.raises(InputError, match="not an image, or damaged; give PNG, JPEG or TIFF"):
+        decoded(EPS, "f.eps")
+
+
+def saved(picture, kind="PNG", **more) -> bytes:
+    file = io.BytesIO()
+    picture.save(file, kind, **more)
+    return file.getvalue()
+
+
+def test_a_size_is_checked_before_an_image_is_decoded(monkeypatch):
+    def refuse(shape):
+        raise InputError("a.png", f"of {shape}")
+    data = saved(Image.fromarray(GREY))
+    monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("decoded"))
+    for asked in (lambda: decoded(data, "a.png", refuse),
+                  lambda: picture_of(SimpleNamespace(format="png", data=data), refuse),
+                  lambda: picture_of(message(GREY, "mono8"), refuse)):
+        with pytest.raises(InputError, match=r"of \(3, 4\)"):
+            asked()
+
+
+def test_few_bytes_are_no_large_image():
+    """10 kB of PNG can hold a hundred million pixels of one value."""
+    bomb = saved(Image.new("1", (6000, 6000)))
+    assert len(bomb) < 6000 * 6000 / 1000
+    with pytest.raises(InputError, match="6000 x 6000 pixels in"):
+        decoded(bomb, "f.png")
+    assert decoded(saved(Image.new("1", (60, 60))), "f.png").values.shape == (60, 60)
+
+
+def test_floating_point_values_are_refused():
+    """Their black and white are not in the file: 0 and 1, or 0 and 65535."""
+    data = saved(Image.fromarray(GREY.astype(np.float32) / 100), "TIFF")
+    with pytest.raises(InputError, match="floating-point values, whose black and white are unkn"):
+        decoded(data, "f.tif")
+
+
+@pytest.mark.parametrize("pages, more", [(1, False), (3, True)])
+def test_pages_beyond_the_first_are_told(pages, more):
+    first, *others = [Image.fromarray(GREY + 10 * page) for page in range(pages)]
+    found = decoded(saved(first, "TIFF", save_all=True, append_images=others), "f.tif")
+    assert (found.values == GREY).all() and found.more_pages is more

@@ -12,6 +12,10 @@ OPTIONS = {name: name for name in ("pixel_size", "mark", "mark_size", "mark_widt
 """Options of commands that look for marks -> names of parameters."""
 
 
+ANY_NUMBER = 1_000_000
+"""`max_marks` of images that somebody waits for: no limit."""
+
+
 @dataclass(frozen=True)
 class DetectorSettings(ManagedSettings):
     """How mark_detector finds marks in images."""
@@ -46,5 +50,8 @@ class DetectorSettings(ManagedSettings):
     max_sigma_px: float = declared(
         0.3, "standard uncertainty of a centre above which a mark is rejected as weak", "px",
         0.0, 100.0)
+    max_marks: int = declared(
+        1000, "possible marks of an image above which it is refused, as each takes a millisecond; "
+        "files are not limited", "", 1, ANY_NUMBER)
     max_waiting: int = declared(
         32, "images that may wait; more are discarded and counted", "", 1, 1000)
