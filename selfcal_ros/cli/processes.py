@@ -12,6 +12,7 @@ import json
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +36,8 @@ NEVER_AGAIN = (2,)
 ONCE = ("bag_recorder",)
 """Nodes that cannot be restarted: their folder exists."""
 KEPT_LINES = 200
+FIRST_PORT, PORTS_OF_DOMAIN = 7410, 250
+"""UDP port of the first participant of domain 0, and distance to that of the next (DDSI-RTPS)."""
 
 
 def need_ros(alternative: str) -> None:
@@ -121,16 +124,21 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-@contextlib.contextmanager
-def domain() -> Iterator[dict]:
-    """Yield an environment with its own ROS domain on this machine.
+REACHES_OTHERS = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER", "FASTRTPS_DEFAULT_PROFILES_FILE",
+                  "FASTDDS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI")
+"""Variables of the environment that can lead nodes beyond this machine."""
 
-    An existing ROS_DOMAIN_ID is kept, so that `ros2 topic echo` can be used.
+
+@contextlib.contextmanager
+def domain(chosen: int | None = None) -> Iterator[dict]:
+    """Yield an environment with its own ROS domain, or the one chosen, on this machine alone.
+
+    The domain of the environment may be that of a real cell.
     """
-    environment = dict(os.environ)
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    if environment.get("ROS_DOMAIN_ID"):
-        yield environment
+    environment = {name: value for name, value in os.environ.items() if name not in REACHES_OTHERS}
+    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    if chosen is not None:
+        yield environment | {"ROS_DOMAIN_ID": str(chosen)}
         return
     for number in range(50, 100):
         with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
@@ -138,9 +146,22 @@ def domain() -> Iterator[dict]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 continue
+            if _is_used(number):
+                continue
             yield environment | {"ROS_DOMAIN_ID": str(number)}
             return
-    raise RuntimeError("fifty replays at once")
+    raise InputError("ROS domains 50 to 99", "all are in use on this machine",
+                     "end other replays, or choose one with --domain")
+
+
+def _is_used(number: int) -> bool:
+    """Return whether the port of the first participant of a domain on this machine is taken."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", FIRST_PORT + PORTS_OF_DOMAIN * number))
+        except OSError:
+            return True
+    return False
 
 
 class Supervisor:

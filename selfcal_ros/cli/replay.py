@@ -34,6 +34,8 @@ from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
 AS_RECORDED = -1
 LARGEST_SEED = 2**31
+MOST_DOMAIN = 232
+"""Largest ROS domain whose ports exist."""
 NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 
@@ -52,6 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
+    parser.add_argument("--domain", type=int, metavar="ID", help="ROS domain to play in, to watch "
+                        "with ros2 topic echo; refused if somebody publishes in it (default: one "
+                        "that nobody uses)")
     parser.add_argument("--quiet", action="store_true", help="print no summary")
     images = parser.add_argument_group("for a bag with images and no detections", "options of "
                                        "mark_detector, as in selfcal detect, or in NODES.yaml")
@@ -66,11 +71,14 @@ def run(args: argparse.Namespace) -> int:
     if args.shuffle is not None and not 0 <= args.shuffle <= LARGEST_SEED:
         raise InputError("--shuffle", f"{args.shuffle} is not a seed",
                          f"give a number from 0 to {LARGEST_SEED}")
+    if args.domain is not None and not 0 <= args.domain <= MOST_DOMAIN:
+        raise InputError("--domain", f"{args.domain} is not a ROS domain",
+                         f"give a number from 0 to {MOST_DOMAIN}")
     check_outputs([args.bag, args.params], [file_of(args)])
     source, detector = bag_input(args.bag), detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
     with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
-          domain() as environment):
+          domain(args.domain) as environment):
         saved = folder / "result.json"
         code, unplayed = _play(args, saved, environment, detector)
         bag = bag_lines(args.bag, settings, args.namespace)

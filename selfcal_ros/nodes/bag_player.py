@@ -29,26 +29,35 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         self.exit_code = ExitCode.DONE
         listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
         self.player = Player(self, self.settings.bag, rate=self.settings.rate,
-                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE)
+                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE,
+                             beside_others=self.settings.beside_others)
         self._patience = time.monotonic() + patience_s
-        self._started = not listener or not patience_s
+        self._waits = bool(listener and patience_s)
+        self._started = False
         self.every(0.002, self._step)
 
     def diagnosis(self) -> Diagnosis:
         """Return the progress, and the node it waits for."""
         level, line = Level.OK, "playing"
         if not self._started:
-            level, line = Level.WARN, "waiting for " + (
-                self.player.listener if self.player.unheard() else self.player.detector)
+            level, line = Level.WARN, self._waits_for()
         elif self.player.stalled_s > STALLED_S:
             level, line = Level.WARN, f"{self.player.listener} takes no more messages"
         return Diagnosis(level, line, {"played": self.player.played, "total": self.player.total})
+
+    def _waits_for(self) -> str:
+        if self._waits and self.player.unheard():
+            return f"waiting for {self.player.listener}"
+        if self._waits and self.player.unseen():
+            return f"waiting for {self.player.detector}"
+        return "looking who else publishes"
 
     def _step(self) -> None:
         if self.finished.done():
             return
         try:
-            self._started = self._started or self._is_heard()
+            self._started = self._started or (
+                self.player.is_alone() and (not self._waits or self._is_heard()))
             if self._started:
                 self.player.step()
         except SelfcalError as error:

@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which publishers a node hears, and how reliably: those of others do not count."""
+"""Which publishers a node hears, and how reliably; who else publishes.
 
-from collections.abc import Mapping
+The listeners of others do not count.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -44,6 +48,27 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
         node.resolve_topic_name(topic))
         if reader.qos_profile.durability == DurabilityPolicy.VOLATILE]  # others never match
     return matched >= len(readers) and by in [_name(reader) for reader in readers]
+
+
+def others_on(node: Node, topics: Iterable[str], own: Iterable[str]) -> dict[str, list[str]]:
+    """Return the nodes that publish on topics, with these topics, but not `own`.
+
+    Parameters
+    ----------
+    node : Node
+        A node that sees all publishers.
+    topics : iterable of str
+        The topics.
+    own : iterable of str
+        Names of nodes with their namespaces; each may publish on a topic once.
+    """
+    found: dict[str, list[str]] = {}
+    allowed = Counter(own)
+    for topic in topics:
+        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+        for other in Counter(map(_name, offers)) - allowed:
+            found.setdefault(other, []).append(topic)
+    return found
 
 
 def _name(reader: TopicEndpointInfo) -> str:

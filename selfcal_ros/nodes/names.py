@@ -96,6 +96,7 @@ def image_topics(transport: str, depth: int) -> tuple[Topic, Topic]:
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
 RESULTS = (STATUS, MEASUREMENT, ERROR_MAP, SUMMARY, CORRECTED)
+COMMANDED = (MOTION, CORRECTED_MOTION)
 
 
 def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:

@@ -11,11 +11,15 @@ from rclpy.duration import Duration
 
 from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.collection.settings.nodes import (
+    CollectorSettings,
+    SequencerSettings,
+    SolverSettings,
+)
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.hearing import hears, not_heard
+from selfcal_ros.nodes.hearing import hears, not_heard, others_on
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS
 from selfcal_ros.units import S_PER_NS
 
@@ -30,6 +34,11 @@ IMAGE_DEPTH = 32
 """Images kept for subscribers that have not acknowledged them."""
 BURST, SLICE_S = 100, 0.02
 """Messages between checks of the time and of the subscribers' progress; longest step."""
+LOOK_S = 1.0
+"""Time for finding other publishers before the first message, and between looks after it."""
+UNNAMED, NAME_S = "_NODE_NAME_UNKNOWN_", 10.0
+"""Name of a node in the graph whose publishers are found before itself; longest wait for its
+own."""
 UNHEARD_RATE = 4000
 """Messages per second while no collector reports its progress."""
 
@@ -41,11 +50,13 @@ class Player:
     trailing fields than this package's. `seed` shuffles the order of arrival, not the stamps;
     `namespace` is that of the cell in the bag, None = the only one; `listener` is the node that
     sets the pace. Images take the place of missing detections, at the pace of mark_detector in the
-    node's namespace.
+    node's namespace. It plays only where nobody else publishes on its topics, but the nodes
+    of selfcal in its namespace, unless `beside_others`.
     """
 
     def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
-                 namespace: str | None = None, listener: str = CollectorSettings.NODE) -> None:
+                 namespace: str | None = None, listener: str = CollectorSettings.NODE,
+                 beside_others: bool = False) -> None:
         self.node, self.rate, self._bag = node, rate, bag
         own = node.get_namespace().rstrip("/")
         self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
@@ -67,6 +78,11 @@ class Player:
         self._began: float | None = None
         self._published_s = 0.0  # last time that a message was sent, or none was due
         self._before = 0  # messages received by the listener before the first of these
+        self.alone_on = [] if beside_others else [*self._publishers]
+        self._own = [node.get_fully_qualified_name(), *(f"{own}/{name}" for name in (
+            SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE))]
+        self._own += [self.detector] if images else []
+        self._created_s = self._looked_s = time.monotonic()
         received = names.of_node(self.listener, names.RECEIVED)
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
@@ -126,9 +142,43 @@ class Player:
             KINDS[topic]: self.found if topic == DETECTION_TOPIC else self.sent[KINDS[topic]]
             for topic in KINDS}
 
+    @property
+    def overheard(self) -> bool:
+        """Whether the listener has received more than was sent, from somebody else."""
+        heard = self.heard or {}
+        return any(heard.get(kind, 0) > sent for kind, sent in self.sent.items())
+
+    def is_alone(self) -> bool:
+        """Return whether nobody else publishes where this one will; False until that is known.
+
+        Raises
+        ------
+        InputError
+            If somebody does.
+        """
+        self._looked_s = time.monotonic()
+        looked_s = self._looked_s - self._created_s
+        others = others_on(self.node, self.alone_on, self._own)
+        named = {other: topics for other, topics in others.items()
+                 if not other.endswith(UNNAMED) or looked_s > NAME_S}
+        for other, topics in named.items():
+            raise InputError(
+                f"ROS domain {self.node.context.get_domain_id()}",
+                f"{other} publishes {', '.join(topics)} as well; {self._at} messages were played",
+                "end it, or play in another ROS domain")
+        return not others and (looked_s >= LOOK_S or not self.alone_on)
+
     def step(self) -> None:
-        """Publish the messages due now."""
+        """Publish the messages due now.
+
+        Raises
+        ------
+        InputError
+            If somebody else began to publish on the topics played, or the bag has changed.
+        """
         now = time.monotonic()
+        if now - self._looked_s >= LOOK_S:
+            self.is_alone()
         if self._began is None:
             self._began, self._before = now, self._received
             self._taken_before = self.taken or 0

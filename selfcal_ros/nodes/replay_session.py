@@ -21,7 +21,7 @@ from selfcal_ros.collection.settings.nodes import PlayerSettings
 from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.player import Player
+from selfcal_ros.nodes.player import IMAGES, Player
 from selfcal_ros.nodes.running import run
 
 PATIENCE_S = 60.0
@@ -37,6 +37,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
         self.player = player(self)
+        self.player.alone_on += [topic.name for topic in (*names.RESULTS, *names.COMMANDED)]
         self._finish = self.create_client(Trigger, "measurement_collector/finish")
         self._save = self.create_client(SaveMap, "solver/save_map")
         self._act: Callable[[], None] = self._wait_for_nodes
@@ -67,7 +68,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             (self.player.listener, self.player.unheard()),
             (self.player.detector, self.player.unseen())) if topics]
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
-        if not alone and ready:
+        if self.player.is_alone() and not alone and ready:
             self._go(self._play)
         elif self._late():
             self._end(" and ".join(alone) or "no services of collector and solver",
@@ -87,12 +88,16 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
     def _wait_until_received(self) -> None:
         if self.player.arrived:
             self._ask(self._finish, Trigger.Request(), self._on_finished)
+        elif self.player.overheard:
+            self._end(f"the nodes heard somebody else as well: {self._counts()}; play in a ROS "
+                      "domain of its own", ExitCode.BAD_INPUT)
         elif self._late():
             self._end(f"messages were lost: {self._counts()}", ExitCode.INTERNAL)
 
     def _counts(self) -> str:
-        images = "" if self.player.taken is None else f", {self.player.taken} images"
-        return f"sent {self.player.sent}, received {self.player.heard}{images}"
+        received = (self.player.heard or {}) | {IMAGES: self.player.taken or 0}
+        return ", ".join(f"{received.get(kind, 0)} of {sent} {kind} messages received"
+                         for kind, sent in self.player.sent.items())
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:
         answer = client.call_async(request)

@@ -55,6 +55,14 @@ def graph(ros_environment):
     graph.close()
 
 
+@pytest.fixture(autouse=not MISSING)
+def short_look(monkeypatch):
+    """Have players look for other publishers for a moment: the graph of a test has only its own."""
+    from selfcal_ros.nodes import player
+
+    monkeypatch.setattr(player, "LOOK_S", 0.05)
+
+
 @pytest.fixture
 def quick_beat(monkeypatch):
     """Have nodes tell their health at once and often: for tests of what it says, not of when."""

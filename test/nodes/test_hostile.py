@@ -119,10 +119,11 @@ def all_kinds(graph, cell, tmp_path):
     bag = str(small_bag(tmp_path / "beside"))
     graph.node(partial(StageSimulator, namespace="beside"))
     graph.node(partial(MarkDetectorNode, namespace="beside"), **DETECTS)
-    graph.node(partial(BagPlayer, namespace="beside"), bag=bag, wait_for_subscribers=3600.0)
+    graph.node(partial(BagPlayer, namespace="beside"), bag=bag, wait_for_subscribers=3600.0,
+               beside_others=True)
     graph.node(partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0))
-    graph.add(ReplaySession(partial(Player, bag=bag, rate=1.0, seed=-1), "none.json",
-                            namespace="replay", context=graph.context))
+    graph.add(ReplaySession(partial(Player, bag=bag, rate=1.0, seed=-1, beside_others=True),
+                            "none.json", namespace="replay", context=graph.context))
     nodes = [node for node in graph.nodes if node is not graph.hand]
     assert {type(node) for node in nodes} == set(kinds())
     return nodes

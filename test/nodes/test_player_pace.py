@@ -26,7 +26,8 @@ def player_of(count: int, sent: list, rate: float, topic: str = next(iter(KINDS)
     for name, value in {"playlist": range(count), "_at": 0, "_began": None, "rate": rate,
                         "_messages": messages, "_next": next(messages), "_first_ns": T0,
                         "heard": None, "sent": Counter(dict.fromkeys(KINDS.values(), 0)),
-                        "_before": 0, "_published_s": 0.0,
+                        "_before": 0, "_published_s": 0.0, "_created_s": 0.0, "_looked_s": 0.0,
+                        "node": None, "alone_on": [], "_own": [],
                         "_publishers": {topic: SimpleNamespace(publish=sent.append)}}.items():
         setattr(played, name, value)
     return played

@@ -4,6 +4,7 @@
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 
+from selfcal_ros.cli import processes
 from selfcal_ros.cli.replay import NODES
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.forked import Fork, Forks
@@ -86,7 +88,7 @@ SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGT
 
 def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
-    needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001"],
+    needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001", "-p", "beside_others:=true"],
               "bag_recorder": ["-p", f"bag:={recorded}"],
               "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
               "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"]}
@@ -155,7 +157,8 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
 def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
     bag, nodes = small_bag(tmp_path), NODES[1:2]  # and the session: a first and a last child
     some = f"from selfcal_ros.cli import replay; replay.NODES = {nodes}; "
-    replay = group.start("-c", some + SELFCAL, "replay", str(bag), "--rate", "0.001")
+    replay = group.start("-c", some + SELFCAL, "replay", str(bag), "--rate", "0.001",
+                         "--domain", group.environment["ROS_DOMAIN_ID"])
     graph.until(lambda: {"bag_player", *nodes} <= set(graph.hand.get_node_names()), "the nodes")
     (os.killpg if whole_group else os.kill)(replay.pid, signal.SIGINT)
     code, _, err = ended(replay)
@@ -279,3 +282,27 @@ def test_a_demo_that_is_interrupted_is_one_line(group, module, who):
     code, _, err = ended(group.start("-c", INTERRUPTED_DEMO.format(
         modules=(module,), demo=str(Path(__file__).parents[2] / "tools/demo.py"))))
     assert (code, err) == (128 + signal.SIGINT, f"{who}: interrupted\n")
+
+
+def test_a_domain_is_no_cells_and_on_this_machine_alone(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    monkeypatch.setenv("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")
+    monkeypatch.setenv("ROS_STATIC_PEERS", "10.0.0.2")
+    with processes.domain() as first, processes.domain() as second:
+        numbers = [int(environment["ROS_DOMAIN_ID"]) for environment in (first, second)]
+    assert len(set(numbers)) == 2 and all(50 <= number < 100 for number in numbers)
+    assert first["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert not {"ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS"} & first.keys()
+    with processes.domain(7) as chosen:
+        assert chosen["ROS_DOMAIN_ID"] == "7"
+        assert chosen["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+
+
+def test_a_domain_that_somebody_uses_is_left_to_him():
+    with processes.domain() as environment:
+        free = int(environment["ROS_DOMAIN_ID"])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(("", 7400 + 250 * free + 10))
+        with processes.domain() as environment:
+            assert int(environment["ROS_DOMAIN_ID"]) != free

@@ -200,6 +200,50 @@ def test_a_listener_is_one_by_name_and_namespace(graph, bag, listener, heard):
     assert (player.unheard() == []) is heard
 
 
+DRIVER = "/hand publishes stage/joint_states as well; 0 messages were played"
+
+
+def test_nothing_is_played_beside_somebody_elses_publisher(graph, bag):
+    heard = endless(graph.hand, "")
+    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
+    lines: list = []
+    player.say = lambda level, line: lines.append((level, line))
+    graph.until(player.finished.done, "its end")
+    assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
+    [(level, line)] = lines
+    assert level == Level.ERROR and DRIVER in line
+
+
+def test_a_bag_is_played_beside_others_where_that_is_asked_for(graph, bag):
+    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", beside_others=True)
+    graph.until(player.finished.done, "the end of the bag")
+    assert (player.exit_code, player.player.done) == (ExitCode.DONE, True)
+
+
+def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
+    graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
+        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", wait_for_subscribers=0.0)
+    graph.until(player.finished.done, "the end of the bag")
+    assert player.player.done
+    graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
+        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+    graph.remove(player)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
+    graph.until(player.finished.done, "its end")
+    assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 0)
+
+
+def test_a_publisher_that_comes_while_a_bag_is_played_ends_the_player(graph, bag):
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.01, listener="")
+    graph.until(lambda: player.player.played, "the first message")
+    graph.hand.create_publisher(names.DETECTIONS.type, names.DETECTIONS.name, names.DETECTIONS.qos)
+    graph.until(player.finished.done, "its end")
+    assert player.exit_code == ExitCode.BAD_INPUT and not player.player.done
+
+
 def test_a_listener_of_one_topic_alone_is_not_enough(graph, bag):
     node = graph.add(Node("one", context=graph.context))
     endless(node, "", [names.DETECTIONS])
@@ -212,7 +256,7 @@ def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(gra
     driver = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
                                          names.ENCODER_EITHER[1].qos)
     graph.node(MeasurementCollector)
-    player = graph.node(BagPlayer, bag=str(bag), rate=0.0).player
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, beside_others=True).player
     graph.until(lambda: len(player.unheard()) == 1, "the collector")
     assert player.unheard() == [
         "stage/joint_states reliably (another publisher offers best effort)"]

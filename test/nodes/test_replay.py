@@ -247,7 +247,8 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
         solver.publish(String(data=text))
     tell("of three views")
     player = SimpleNamespace(listener="", unheard=list, detector="", unseen=list, done=True,
-                             step=lambda: None, played=1, total=1, arrived=True,
+                             step=lambda: None, played=1, total=1, arrived=True, alone_on=[],
+                             is_alone=lambda: True,
                              playlist=SimpleNamespace(lost=[]))
     session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
     graph.hand.create_timer(0.005, lambda: turns.append(session._digest))
@@ -257,7 +258,41 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
     assert (saved, session.exit_code) == (["of all views"], 0)
 
 
+@pytest.mark.parametrize(("topic", "played"), [
+    (names.ENCODER, "stage/joint_states"), (names.ERROR_MAP, "selfcal/error_map"),
+    (names.MOTION, "stage/command")])
+def test_a_session_plays_nothing_where_somebody_else_publishes(
+        graph, solved, tmp_path, capfd, topic, played):
+    graph.hand.create_publisher(topic.type, topic.name, topic.qos)
+    heard = graph.listen(names.DETECTIONS)
+    player = partial(Player, bag=str(solved[0]), rate=0.0, seed=-1)
+    session = graph.add(ReplaySession(player, str(tmp_path / "r.json"), context=graph.context))
+    graph.until(session.finished.done, "the end of the session")
+    domain = graph.context.get_domain_id()
+    assert (session.exit_code, heard) == (2, [])
+    assert capfd.readouterr().err == (
+        f"selfcal replay: ROS domain {domain}: /hand publishes {played} as well; 0 messages were "
+        "played; end it, or play in another ROS domain\n")
+
+
+def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
+    player = SimpleNamespace(
+        listener="", unheard=list, detector="", unseen=list, done=True, step=lambda: None,
+        played=5, total=5, arrived=False, alone_on=[], is_alone=lambda: True, overheard=True,
+        taken=None, sent={"encoder": 3, "detection": 2}, heard={"encoder": 9, "detection": 2},
+        playlist=SimpleNamespace(lost=[]))
+    graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
+    graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
+    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    graph.until(session.finished.done, "the end of the session")
+    assert session.exit_code == 2
+    assert capfd.readouterr().err == (
+        "selfcal replay: the nodes heard somebody else as well: 9 of 3 encoder messages received, "
+        "2 of 2 detection messages received; play in a ROS domain of its own\n")
+
+
 @pytest.mark.parametrize("options, problem", [
+    (["--domain", "233"], "--domain: 233 is not a ROS domain; give a number from 0 to 232"),
     (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
     (["--shuffle", "-1"], "--shuffle: -1 is not a seed; give a number from 0 to 2147483648"),
     (["--shuffle", "2147483649"], "--shuffle: 2147483649 is not a seed; give a number from 0")])

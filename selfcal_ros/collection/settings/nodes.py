@@ -239,6 +239,9 @@ class PlayerSettings(Settings):
     wait_for_subscribers: float = declared(
         30.0, "longest wait for that node, after which the player ends with code 2 without having "
         "played anything; 0 = play without waiting", "s", 0.0, 3600.0)
+    beside_others: bool = declared(
+        False, "also play where another node publishes on the topics played, e.g. the driver of a "
+        "stage; false = end with code 2 and the name of that node")
 
 
 @dataclass(frozen=True)
