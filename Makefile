@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 
-.PHONY: setup demo test test-oldest lint ament-lint bench soak chaos mutants reality pictures reference sbom clean help
+.PHONY: setup demo test test-oldest lint ament-lint bench soak chaos mutants reality pictures map3d reference sbom clean help
 help:
 	@echo "make setup | demo | test | test-oldest | lint | ament-lint | bench | soak | chaos | mutants | reality | pictures | reference | sbom | clean"
 setup:
@@ -23,9 +23,10 @@ build/linters/.clean: build/linters/.complete setup.cfg $(shell find $(LINTED) -
 ament-lint: build/linters/.clean  # what ament_flake8 and ament_pep257 check, with setup.cfg
 # bytecode is kept: else each worker compiles all tests anew, and each process that they start the package
 # three workers on two cores: as a rule one waits for a message
-build/oracles/.complete: tools/oracle-requirements.txt | setup
-	@mkdir -p build/oracles; $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes \
-		--upgrade --target build/oracles -r $< && touch $@ || echo "test: GTC and lxml are left out: they cannot be installed"
+build/oracles/.complete: tools/oracle-requirements.txt tools/printer-requirements.txt | setup
+	@mkdir -p build/oracles; for pins in $^; do $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--no-deps --require-hashes --upgrade --target build/oracles -r $$pins \
+		|| echo "test: what $$pins names is left out: it cannot be installed"; done; touch $@
 build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
 	@$(BIN)/python $< $(@D) || true
 test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd
@@ -53,6 +54,8 @@ reality: setup  # minutes; e.g. make reality REALITY="--runs 10 --only drift"
 	@$(BIN)/python -m tools.reality $(REALITY)
 pictures: setup  # those of README and docs
 	@$(BIN)/python tools/pictures.py
+map3d:  # selfcal_ros/reporting/assets/map3d.min.js; needs npm
+	@cd tools/map3d && npm ci --silent && npm run --silent build
 reference: setup  # docs/reference.md
 	@$(BIN)/python tools/reference.py
 sbom: setup  # sbom.json: pins, hashes, licences

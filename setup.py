@@ -25,7 +25,7 @@ setup(
     # the message definitions go along, so that bags can be read and written without ROS
     packages=[*find_packages(include=[NAME, f"{NAME}.*"]), f"{NAME}.msg_text"],
     package_dir={f"{NAME}.msg_text": "msg_defs/msg"},
-    package_data={f"{NAME}.msg_text": ["*.msg"]},
+    package_data={f"{NAME}.msg_text": ["*.msg"], f"{NAME}.reporting": ["assets/*.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -37,7 +37,7 @@ setup(
                       "rosbags>=0.10", "matplotlib>=3.6", "rich>=13", "argcomplete>=3",
                       "threadpoolctl>=3", "pillow>=10", "lz4", "zstandard"],
     extras_require={"test": ["pytest>=7.4", "hypothesis>=6.98"],  # colcon looks for pytest here
-                    "dask": ["distributed>=2024.1"]},
+                    "dask": ["distributed>=2024.1"], "pdf": ["weasyprint>=62"]},
     python_requires=">=3.12",
     zip_safe=False,
     maintainer="selfcal_ros maintainers",

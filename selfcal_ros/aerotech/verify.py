@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.aerotech.export import table_xy
-from selfcal_ros.aerotech.model import Table
+from selfcal_ros.aerotech.model import CalFile, Table, Table2D
 from selfcal_ros.compensation.compensator import Compensator
-from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import Correction, Residual, plane_residuals, residual_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
@@ -19,7 +18,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter, Figure
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import Drawing
-from selfcal_ros.reporting.summary.numbers import counted, fixed_column, significant
+from selfcal_ros.reporting.summary.numbers import fixed_column, significant
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -111,47 +110,48 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
                                                for tables in (None, evaluator)])
 
 
-MAX_SITES = 10_201
-"""Sites of a field up to which the table is tried on a simulated controller."""
-
 TITLE = "Exported table: before and after"
 PLACES = {"sites": "at the nodes", "between": "between the nodes", "lines": "at the lines"}
 BEFORE_AND_AFTER = ("before", "after")
 
 
-def table_chapter(result: CalibrationResult) -> Chapter:
-    """Return what the table of `selfcal cal export` leaves of the error, or why it is not tried.
+def frame_of_file(cal: CalFile) -> MachineFrame | None:
+    """Return the frame that the comments of a file state; else columns are x and rows are y.
 
-    As `selfcal cal verify`: the map is the truth at its nodes, the cubic spline through them
-    between.
+    None if it states none and its first table has one axis.
     """
-    emap = result.error_map
-    unknown = int((~emap.valid).sum())
-    if unknown == emap.valid.size:
-        return Chapter(TITLE)
-    if unknown:
-        return _untried(f"{counted(unknown, 'unknown site')}, but a table has no gaps: "
-                        "selfcal cal export --fill fills them from their neighbours")
-    if emap.valid.size > MAX_SITES:
-        return _untried(f"not tried beyond {MAX_SITES} sites: see selfcal cal verify")
-    if max(np.abs(emap.gx).max(), np.abs(emap.gy).max()) > 0.5 * result.artifact.grid_pitch_m:
-        return _untried("a table cannot correct errors beyond half a pitch")
-    frame = MachineFrame()
-    found = verify_tables(emap, [table_xy(emap, frame)], frame)
-    rows = [(PLACES[residual.place], *fixed_column([
-        f(which) * UM_PER_M for f in (residual.rms, residual.largest)
-        for which in BEFORE_AND_AFTER], 4)) for residual in found.residuals]
-    header = ("error vector in µm", "rms before", "after", "largest before", "after")
-    return Chapter(TITLE, (Figure(
-        controller_figure(found), "A simulated controller moving to the nodes and to the "
-        "middle of every cell, without and with the table of selfcal cal export. What remains "
-        "between the nodes is the controller's linear interpolation."),), (Section(
-            "What the table leaves", table=(header, *rows), notes=(
-                "The map is taken as the truth here: its own U adds to what remains.",)),))
+    first = cal.tables[0]
+    stated = frame_from_comments(cal.comments)
+    if stated is None and isinstance(first, Table2D):
+        return MachineFrame(first.column_axis, first.row_axis)
+    return stated
 
 
-def _untried(why: str) -> Chapter:
-    return Chapter(TITLE, sections=(Section("", notes=(why,)),))
+def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
+    """Return what exported tables leave of the error, as `selfcal cal verify`.
+
+    The map is the truth at its nodes, the cubic spline through them between.
+
+    Raises
+    ------
+    InputError
+        If a table corrects or needs an axis outside the frame of the file.
+    """
+    found = verify_tables(result.error_map, cal.tables, frame_of_file(cal) or MachineFrame())
+    rows = []
+    for residual in found.residuals:
+        unit, scale = ("arcsec", ARCSEC_PER_RAD) if residual.place == "lines" else ("µm", UM_PER_M)
+        sizes = [size(which) * scale for size in (residual.rms, residual.largest)
+                 for which in BEFORE_AND_AFTER]
+        rows.append((PLACES[residual.place], *fixed_column(sizes, 4), unit))
+    header = ("error", "rms before", "after", "largest before", "after", "unit")
+    figure = Figure(controller_figure(found),
+                    "A simulated controller moves to the nodes and to the middle of every cell, "
+                    "without and with the exported table. What remains between the nodes is the "
+                    "controller's linear interpolation.")
+    leaves = Section("What the table leaves", table=(header, *rows), notes=(
+        "The map is taken as the truth here: its own U adds to what remains.",))
+    return Chapter(TITLE, (figure,), (leaves,))
 
 
 def controller_figure(found: Verification) -> Drawing:

@@ -14,7 +14,13 @@ from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
 from selfcal_ros.aerotech.read import load_cal, read_cal, refuse_errors
 from selfcal_ros.aerotech.rules import Gi4
-from selfcal_ros.aerotech.verify import controller_figure, plane_correction, setup_of, verify_tables
+from selfcal_ros.aerotech.verify import (
+    controller_figure,
+    frame_of_file,
+    plane_correction,
+    setup_of,
+    verify_tables,
+)
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
@@ -261,10 +267,7 @@ def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | No
 
 def _verify(args: argparse.Namespace) -> int:
     result, cal = read_result(args.result), load_cal(args.file)
-    base = frame_from_comments(cal.comments)
-    if base is None and isinstance(cal.tables[0], Table2D):
-        base = MachineFrame(cal.tables[0].column_axis, cal.tables[0].row_axis)
-    frame = cal_lines.frame_of(args, base)
+    frame = cal_lines.frame_of(args, frame_of_file(cal))
     with busy("simulating the controller"):
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
     say(args, residual_text(found.residuals), figures_of(found.residuals))

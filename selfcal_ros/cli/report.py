@@ -6,6 +6,7 @@ import os
 import sys
 from pathlib import Path
 
+from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
@@ -17,7 +18,7 @@ from selfcal_ros.reporting.report import check_name, write_report
 from selfcal_ros.reporting.summary.numbers import can_print_symbols
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.results import read_result
-from selfcal_ros.standards.chapter import certificate_chapter
+from selfcal_ros.standards.chapter import certificate_chapter, certified
 from selfcal_ros.standards.details import read_details
 
 
@@ -29,6 +30,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
     parser.add_argument("--truth", metavar="TRUTH.json",
                         help="known truth to compare with: gx, gy in m, g_theta in rad")
+    parser.add_argument("--table", metavar="FILE.cal", help="the table that `selfcal cal export` "
+                        "wrote: add the error of a simulated controller before and after it")
     parser.add_argument("--details", metavar="DETAILS.yaml", help="add the contents of a "
                         "certificate: laboratory, customer, item, conditions "
                         "(docs/certificate.md), traceability, U of distances")
@@ -43,25 +46,32 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
-    check_outputs([args.result, args.truth, args.details], [output, args.plot])
+    check_outputs([args.result, args.truth, args.table, args.details], [output, args.plot])
     check_name(output)
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
-    more = [table_chapter(result)]
-    if args.details:
-        more.append(certificate_chapter(result, read_details(args.details)))
+    details = read_details(args.details) if args.details else None
+    more = [table_chapter(result, load_cal(args.table))] if args.table else []
+    if details:
+        more.append(certificate_chapter(result, details))
     with busy("drawing"):
         if args.plot:
             from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth, more=more,
-                     about={name: getattr(args, name) for name in ABOUT})
+        write_report(result, output, truth=truth, more=more, about=_about(args, details))
     written = [str(name) for name in (output, args.plot) if name]
     text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
             ] if args.text else []
     say(args, "\n".join([*text, *(f"written: {name}" for name in written)]),
         {"written": written, "summary": text[0] if text else None})
     return 0
+
+
+def _about(args: argparse.Namespace, details: dict | None) -> dict[str, str]:
+    """Return what the head of the report states: of a certificate, or the options."""
+    named = {name: getattr(args, name) for name in ABOUT}
+    return {**certified(details), **{name: text for name, text in named.items() if text}} \
+        if details else named
 
 
 def read_truth(path: str) -> dict:

@@ -191,9 +191,8 @@ def run(args: argparse.Namespace) -> int:
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
-        from selfcal_ros.aerotech.verify import table_chapter  # draws, as a report alone does
         from selfcal_ros.reporting.report import write_report  # loads every figure
-        write_report(result, args.report, truth=read_truth(args.bag), more=[table_chapter(result)])
+        write_report(result, args.report, truth=read_truth(args.bag))
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
         lines += _since(result)

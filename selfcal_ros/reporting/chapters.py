@@ -12,13 +12,13 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
-from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
     component_maps,
     error_map,
+    uncertainty_map,
 )
 from selfcal_ros.reporting.figures.places import (
     camera_errors,
@@ -58,11 +58,6 @@ DRAWN = {"residuals", "rejected_at", "camera"}
 """Extras that are drawn, not tabulated."""
 _UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
           ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))
-_THETA_DATUM = {
-    ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "
-                        "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
-    ThetaDatum.ZERO_MEAN: "zero_mean: the angular errors add up to zero",
-}
 _SENSE = {"microscope_moves": "the microscope moves over a resting plate",
           "plate_moves": "the plate rides on the stage under a fixed microscope"}
 
@@ -154,19 +149,26 @@ def _cell(key: str, value: Any) -> str:
     return printable(value)
 
 
-ABOUT = ("stage", "serial_number", "operator")
-"""Entries at the head of a report that the readings do not contain."""
+ABOUT = {"stage": "--stage NAME", "serial_number": "--serial-number TEXT",
+         "operator": "--operator NAME"}
+"""Entries at the head of a report that the readings do not contain -> how to give them."""
 
 
 def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
-    """Return what was calibrated, by whom and when; `about` overrides the result."""
+    """Return what was calibrated, by whom and when.
+
+    `about` overrides the result; what it has beyond `ABOUT`, as the number of a certificate, comes
+    first.
+    """
     made = result.provenance
     known = {**made.extra, **{key: value for key, value in about.items() if value}}
     first, last = (str(known.get(key, "")).replace("T", " ")[:16] for key in
                    ("first_exposure", "last_exposure"))
     measured = f"{first} to {last.removeprefix(first[:11])} UTC"
     return Section("Calibration", (
-        *((_words(key), printable(known.get(key) or UNKNOWN)) for key in ABOUT),
+        *((_words(key), printable(value)) for key, value in about.items() if key not in ABOUT),
+        *((_words(key), printable(known.get(key) or f"{UNKNOWN} (not given: {hint})"))
+          for key, hint in ABOUT.items()),
         ("measured", measured if first else UNKNOWN),
         ("evaluated", f"{made.created[:16].replace('T', ' ')} UTC" if made.created else UNKNOWN)))
 
@@ -180,7 +182,7 @@ def convention_section(result: CalibrationResult) -> Section:
          "no translation, rotation or magnification over the field (Hu eq. 5)"),
         ("O and R", "Gx = O·y + R·x + Fx, Gy = O·x − R·y + Fy (Hu eq. 6)")]
     if result.artifact.angular_count:
-        facts.append(("θ datum", _THETA_DATUM[result.error_map.datum_theta]))
+        facts.append(("θ datum", sections.THETA_DATUM[result.error_map.datum_theta]))
     facts += [("sense", _SENSE.get(result.sense, printable(result.sense))),
               ("uncertainty", "u is the standard uncertainty (k=1), U = k u the expanded one, "
                               "k from Student's t for 95.45 % at the degrees of freedom of the "
@@ -193,8 +195,8 @@ def convention_section(result: CalibrationResult) -> Section:
 def said(value: Any) -> str:
     """Return a value as text; the entries of a mapping are listed."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{printable(key)}: {printable(item)}" for key, item in value.items())
-    return printable(str(value))
+        return ", ".join(f"{_words(key)}: {said(item)}" for key, item in value.items())
+    return f"{value:.6g}" if isinstance(value, float) else printable(str(value))
 
 
 def provenance_section(result: CalibrationResult) -> Section:
@@ -213,7 +215,7 @@ def provenance_section(result: CalibrationResult) -> Section:
     if math.isfinite(made.duration_s):
         facts.append(("duration", f"{made.duration_s:.0f} s from the first exposure to the last"))
     if result.reference:
-        facts += [(f"reference {_words(key)}", printable(str(value)))
+        facts += [(f"reference {_words(key)}", said(value))
                   for key, value in result.reference.items() if value != ""]
     return Section("Provenance", tuple(facts))
 
@@ -227,10 +229,12 @@ ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, estima
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing with its caption."""
+    """A drawing with its caption, which `on_screen` completes where there is a pointer."""
 
     drawing: Drawing
     caption: str
+    on_screen: str = ""
+    """What a reader at a screen can do with it."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +262,7 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
     """
     found = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
-        _causes(result), _maps(result, truth), _uncertainty(result), *more, _plate(result),
+        _maps(result, truth), _causes(result), _uncertainty(result), *more, _plate(result),
         Chapter("Camera", _figures((camera_errors(result), "Each vector points from the true "
                                     "position of a mark in the image to the measured one."),
                                     (stage_yaw(result), "Rotation of the image, and of whatever "
@@ -301,20 +305,26 @@ def _causes(result: CalibrationResult) -> Chapter:
         sections.terms_section(result), sections.noise_section(result.noise)))
 
 
+MAP = "Map"
+"""Title of the chapter of the map of the stage."""
+
+
 def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
-    pairs: list[tuple[Drawing | None, str]] = [
-        (error_map(result, truth), "Each vector points from the true position of the stage "
-                                   "to the indicated one. Hover over a site to see its numbers."),
-        (component_maps(result), "Gx and Gy at one scale, and below them their uncertainties. "
-                                 "Unknown sites are grey. Edges and corners are covered by fewer "
-                                 "views.")]
+    """Return the error and its uncertainty, first together, then by component."""
+    vectors = Figure(error_map(result, truth),
+                     "Each vector points from the true position of the stage to the indicated one.",
+                     on_screen="Point at a site to read its numbers.")
+    figures = [vectors, *_figures(
+        (uncertainty_map(result), "How well each node is known: the larger U of x and y. Edges and "
+                                  "corners are covered by fewer views. Unknown nodes are grey."),
+        (component_maps(result), "Gx and Gy at one scale, and below them their uncertainties."))]
     if result.artifact.angular_count:
-        pairs.append((angular_map(result, truth), "Error of the angle at every line; it is "
-                                                  "zero on the dashed circle."))
+        figures += _figures((angular_map(result, truth), "Error of the angle at every line; it is "
+                                                         "zero on the dashed circle."))
     tables = [sections.error_section(result)]
     if truth is not None:
         tables.append(sections.truth_section(result.error_map, truth))
-    return Chapter("Map", _figures(*pairs), tuple(tables))
+    return Chapter(MAP, tuple(figures), tuple(tables))
 
 
 def _plate(result: CalibrationResult) -> Chapter:
@@ -345,7 +355,8 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
             tables.append(_budget_table(budget, unit, scale))
     if not rows:
         return Chapter("Uncertainty")
-    header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k", "dof")
+    header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k",
+              "degrees of freedom")
     return Chapter("Uncertainty", sections=(Section(
         "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables,
         Section("Not in U", notes=tuple(
@@ -359,7 +370,8 @@ def _budget_table(budget: Budget, unit: str, scale: float) -> Section:
     rows = [(line.component, line.kind, *effect, unit, dof_text(line.dof), line.source,
              printable(line.text or line_text(line)))
             for line, *effect in zip(budget.lines, *effects, strict=True)]
-    header = ("component", "type", "u rms", "u largest", "unit", "dof", "source", "from")
+    header = ("component", "type", "u rms", "u largest", "unit",
+              "degrees of freedom", "source", "from")
     name = "x or y" if budget.quantity == "xy" else "θ"
     return Section(f"Uncertainty budget (GUM): {name}", table=(header, *rows))
 

@@ -50,6 +50,23 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
     return Chapter("Certificate", sections=tuple(sections))
 
 
+def certified(details: dict[str, Any]) -> dict[str, str]:
+    """Return what the head of a certificate states, on its first page."""
+    laboratory, customer, item = (details[name] for name in ("laboratory", "customer", "item"))
+    persons = (person["name"] + (f" ({person['role']})" if "role" in person else "")
+               for person in details["persons"])
+    return {"certificate": details["certificate"]["id"],
+            "issued": details["certificate"]["issued"],
+            "laboratory": _addressed(laboratory), "customer": _addressed(customer),
+            "stage": " ".join(item[key] for key in ("manufacturer", "name", "model")
+                              if key in item),
+            "serial_number": item["serial_number"], "operator": ", ".join(persons)}
+
+
+def _addressed(party: dict[str, Any]) -> str:
+    return ", ".join(party[key] for key in ("name", "city", "country") if key in party)
+
+
 def _facts(title: str, found: dict[str, Any]) -> Section:
     return Section(title, tuple((key.replace("_", " "), printable(str(value)))
                                 for key, value in found.items()))

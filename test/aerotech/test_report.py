@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.aerotech.export import table_theta, table_xy
+from selfcal_ros.aerotech.read import parse_cal
 from selfcal_ros.aerotech.verify import controller_figure, table_chapter, verify_tables
+from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.reporting.figures.drawing import Discs, Label, Path
 from test.support.results import known_result
@@ -25,21 +27,10 @@ def words(drawing):
     return [item.text for item in drawing.items if isinstance(item, Label)]
 
 
-def test_a_table_with_holes_or_absurd_errors_is_not_tried():
-    result, _ = known_result(5, 0)
-
-    def why_not(gx, **gy):
-        section, = table_chapter(replace(result, error_map=replace(result.error_map, gx=gx, **gy))
-                                 ).sections
-        return section.notes[0]
-
-    far, none = np.zeros((5, 5)), np.zeros((5, 5))
-    far[1, 2] = -6e-3
-    for gx, gy in ((far, none), (none, far)):
-        assert why_not(gx, gy=gy) == "a table cannot correct errors beyond half a pitch"
-    gx = result.error_map.gx.copy()
-    gx[0, 0] = np.nan
-    assert why_not(gx).startswith("1 unknown site, but")
+def exported(result, frame=None):
+    """Return the file that `selfcal cal export` writes of a result, read back."""
+    text = cal_text([table_xy(result.error_map, frame or MachineFrame())])
+    return parse_cal(text.encode(), "stage.cal")
 
 
 def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
@@ -53,7 +44,8 @@ def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
 
 
 def test_before_and_after_are_drawn_at_one_scale():
-    drawing, = (figure.drawing for figure in table_chapter(parabola()).figures)
+    chapter = table_chapter(parabola(), exported(parabola()))
+    drawing, = (figure.drawing for figure in chapter.figures)
     titles = words(drawing)
     assert [t for t in titles if t.startswith(("before", "after"))] == [
         "before, at the nodes", "after, at the nodes", "before, between the nodes",
@@ -77,3 +69,14 @@ def test_the_lines_before_and_after_share_one_chart():
     assert np.ptp([y for _, y in before]) > 100 > 0.1 > np.ptp([y for _, y in after])
     legend = [text for text in words(drawing) if text.endswith("arcsec") and "rms" in text]
     assert legend[0].startswith("before: rms") and legend[1].startswith("after: rms")
+
+
+def test_a_table_of_the_other_sign_doubles_the_error_that_the_chapter_states():
+    result = parabola()
+    emap = result.error_map
+    flipped = exported(replace(result, error_map=replace(emap, gx=-emap.gx, gy=-emap.gy)))
+    for cal, factor in ((exported(result), 0.0), (flipped, 2.0)):
+        section, = table_chapter(result, cal).sections
+        at_nodes = section.table[1]
+        assert at_nodes[0] == "at the nodes"
+        assert float(at_nodes[2]) == pytest.approx(factor * float(at_nodes[1]), abs=2e-4)

@@ -484,6 +484,10 @@ def test_the_report_has_the_same_for_people(tmp_path, capsys):
     for part in ("EX-2026-0042", "Example Calibration Laboratory", "temperature of the plate",
                  "20.4", "used at 20.4 °C", "U of the distance L", "chromium on fused silica"):
         assert part in text, part
+    first_page = text[:text.index("<h2>")]
+    for part in ("EX-2026-0042", "Example Calibration Laboratory", "Example Machine Builder",
+                 "Example Stages XY-theta stage XYT-200", "4711", "A. Example"):
+        assert part in first_page, part
     assert main(["report", result, "-o", str(page)]) == 0
     assert "EX-2026-0042" not in page.read_text()
     bad = tmp_path / "d.yaml"

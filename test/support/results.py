@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.aerotech.verify import table_chapter
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import (
@@ -85,7 +84,7 @@ def covered(result: CalibrationResult, g: np.ndarray) -> float:
 def chapters_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None,
                 ) -> list[Chapter]:
     """Return the chapters of the report that `selfcal report` writes."""
-    return chapters(result, truth_arrays(result.error_map, truth), [table_chapter(result)])
+    return chapters(result, truth_arrays(result.error_map, truth))
 
 
 def html_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None) -> str:

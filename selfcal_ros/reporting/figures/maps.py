@@ -198,6 +198,27 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
         frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
 
 
+def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
+    """Return the larger expanded uncertainty of x and y at every node; None if none is known."""
+    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
+    U_um = np.where(emap.valid, np.fmax(emap.u_gx, emap.u_gy), np.nan) * k * UM_PER_M
+    if not np.isfinite(U_um).any():
+        return None
+    drawing = parts.titled("uncertainty-map", f"Uncertainty of the map, U with k = {k:.3g}")
+    frame = _frame(drawing, artifact, [np.zeros((2, 1))])
+    scale = parts.range_scale("v", U_um)
+    parts.cells(frame, artifact, U_um, scale)
+    frame.axes(x_label="stage x in mm", y_label="stage y in mm")
+    left, top, width, height = frame.box
+    if scale.low == scale.high:
+        drawing.label(left + width / 2, top + height / 2 + 4,
+                      f"{significant(scale.high)} µm everywhere", anchor="middle")
+    else:
+        parts.scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
+    drawing.height = top + height + 92
+    return drawing
+
+
 def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Drawing:
     """Return Gx and Gy at one scale, and below them their U at a scale of its own.
 

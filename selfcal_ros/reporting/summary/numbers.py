@@ -17,9 +17,9 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M, URAD_PER_RAD
 
 UNKNOWN = "–"
-_NUMBER = re.compile(r"[−+-]?\d[\d.]*(e[+-]?\d+)?|–|many")
+_NUMBER = re.compile(r"(> )?[−+-]?\d[\d.]*(e[+-]?\d+)?|–|∞")
 _ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
-          "σ": "sigma", "²": "^2", "−": "-"}
+          "σ": "sigma", "²": "^2", "−": "-", "∞": "inf"}
 
 
 def to_ascii(text: str) -> str:

@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.terms import TermName
@@ -77,6 +77,13 @@ def enlargement_texts(verdict: Verdict) -> list[str]:
             f"{unit(item.u_max)} largest" for item, unit in (
                 (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by)]
 
+
+THETA_DATUM = {
+    ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "
+                        "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
+    ThetaDatum.ZERO_MEAN: "zero_mean: the angular errors add up to zero",
+}
+"""Which constant of the angular errors is convention, in words."""
 
 _TITLES = {Grade.GOOD: "Verdict", Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLARGED U",
            Grade.NOT_QUALIFIED: "Verdict: NOT QUALIFIED"}
@@ -249,7 +256,7 @@ def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     return [*facts, *_spread_facts("θ uncertainty", arcsec, (figures.rms_u_theta_rad,
                                                              figures.max_u_theta_rad),
                                    (result.noise.k_theta, result.noise.dof_of("theta"))),
-            ("θ datum", str(emap.datum_theta))]
+            ("θ datum", THETA_DATUM[emap.datum_theta])]
 
 
 def _spread_facts(label: str, unit: Callable[[float], str], u: tuple[float, float],
@@ -279,7 +286,8 @@ def noise_section(noise: Noise) -> Section:
         shown = aligned_numbers([value * scale for value in (used, repeats, residuals)])
         rows.append((f"{label} ({unit})", *shown[:2], _dof(dofs[0]), shown[2], _dof(dofs[1]),
                      significant(ratio)))
-    header = ("one reading", "σ used", "repeats", "dof", "residuals", "dof", "residuals/repeats")
+    header = ("one reading", "σ used", "repeats", "degrees of freedom", "residuals",
+              "degrees of freedom", "residuals/repeats")
     if not rows:
         return Section("Noise", notes=("not known: no mark was read twice and no detection "
                                        "declared its uncertainty",))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Phrases for the lines of an uncertainty budget, the result of a recheck, and counts of views."""
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,12 +23,14 @@ OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
 
 
 COUNTED_DOF = 1e5
-"""Degrees of freedom from which on they are shown as ``many``."""
+"""Degrees of freedom from which on their number tells a reader nothing."""
 
 
 def dof_text(dof: float) -> str:
-    """Return degrees of freedom as an integer, or ``many``."""
-    return f"{dof:.0f}" if dof < COUNTED_DOF else "many"
+    """Return degrees of freedom as an integer, ``> 100000``, or ``∞``."""
+    if dof < COUNTED_DOF:
+        return f"{dof:.0f}"
+    return f"> {COUNTED_DOF:.0f}" if math.isfinite(dof) else "∞"
 
 
 def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
