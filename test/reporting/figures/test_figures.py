@@ -193,7 +193,7 @@ def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_o
     np.testing.assert_allclose(found.radii, np.outer(gain, (2.5 * 3e-7, 2.5 * 1e-7)))
     np.testing.assert_allclose(found.centres, vectors[:, 1])
     words = [item.text for item in drawing.items if isinstance(item, Label)]
-    assert "U, k = 2.5" in words
+    assert "U at the nodes, k = 2.5" in words
     told = next(item.title for item in drawing.items if isinstance(item, Spot))
     assert "± 0.750 µm" in told and "± 0.250 µm (k = 2.5)" in told
 
