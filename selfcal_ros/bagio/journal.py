@@ -151,24 +151,37 @@ def start(folder: str | os.PathLike, now_ns: int) -> "Journal":
     """
     name = time.strftime("journal_%Y%m%dT%H%M%SZ", time.gmtime(now_ns // NS_PER_S))
     for suffix in ("", *(f"_{number}" for number in range(2, 1000))):
-        bag = Path(folder) / (name + suffix)
-        try:
-            bag.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise InputError(str(bag), f"cannot be created ({error.strerror})",
-                             "name a writable folder") from error
-        with _as_input_error(bag):
-            lock = _locked(bag)
-            try:
-                return Journal(bag, lock, Metadata())
-            except BaseException:
-                os.close(lock)
-                with suppress(OSError):
-                    bag.rmdir()
-                raise
+        with suppress(FileExistsError):
+            return create(Path(folder) / (name + suffix))
     raise InputError(str(folder), f"holds a thousand journals of {name}", "remove some")
+
+
+def create(bag: Path) -> "Journal":
+    """Start a new journal that is the bag folder `bag`.
+
+    Raises
+    ------
+    FileExistsError
+        If it exists.
+    InputError
+        If it cannot be created.
+    """
+    try:
+        bag.mkdir(parents=True)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise InputError(str(bag), f"cannot be created ({error.strerror})",
+                         "name a writable folder") from error
+    with _as_input_error(bag):
+        lock = _locked(bag)
+        try:
+            return Journal(bag, lock, Metadata())
+        except BaseException:
+            os.close(lock)
+            with suppress(OSError):
+                bag.rmdir()
+            raise
 
 
 class Journal(Closing):

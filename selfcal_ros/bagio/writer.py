@@ -255,9 +255,7 @@ class BagWriter(Closing):
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""
         typename = self._metadata.topics[topic].type
-        store = store_with(typename)
-        message = build(store, typename, fields)
-        self.write_raw(topic, bytes(store.serialize_cdr(message, typename)), log_time_ns)
+        self.write_raw(topic, cdr_bytes(typename, fields), log_time_ns)
 
     def write_raw(self, topic: str, data: bytes, log_time_ns: int) -> None:
         """Write one message given by its CDR bytes."""
@@ -283,6 +281,12 @@ class BagWriter(Closing):
         with writing(self.path), self._file:
             self._mcap.finish()
         self._metadata.write(self.path)
+
+
+def cdr_bytes(typename: str, fields: Fields) -> bytes:
+    """Return the CDR bytes of a message of a known type."""
+    store = store_with(typename)
+    return bytes(store.serialize_cdr(build(store, typename, fields), typename))
 
 
 def build(store: Typestore, typename: str, fields: Fields) -> object:

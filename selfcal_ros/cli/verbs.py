@@ -38,6 +38,7 @@ VERBS = {
     "up": Verb(MEASURE, "start the nodes of a cell, and calibrate on one screen"),
     "monitor": Verb(MEASURE, "show a running cell on one screen, and operate it by keys"),
     "call": Verb(MEASURE, "ask a running cell to start, confirm, redo, skip or abort"),
+    "measure": Verb(MEASURE, "measure a plan with a machine, without ROS, and solve"),
     "cell": Verb(MEASURE, "check a machine cell before its first calibration"),
     "camera": Verb(MEASURE, "find the pixel size, rotation and mirroring of a camera"),
     "detect": Verb(MEASURE, "find the marks in the images of a bag"),
@@ -69,6 +70,8 @@ EXAMPLES = {
     "monitor": "selfcal monitor --namespace cell_1",
     "call": "selfcal call start",
     "cell check": "selfcal cell check --plan config/plans/hu.yaml",
+    "measure": "selfcal measure config/plans/hu_repeated.yaml config/cells/simulated.yaml "
+               "-o measured --yes",
     "camera init": "selfcal camera init bags/camera -o nodes.yaml --mark-size 72e-6 "
                    "--mark-pixels 12",
     "detect": "selfcal detect bags/camera -o marks --pixel-size 6e-6 --mark disc "

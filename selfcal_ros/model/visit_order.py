@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import DEFAULT_ORDER, View, VisitOrder, parse_order
 
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -89,6 +90,48 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     lines = np.rint(places) if artifact.marks else places  # of a list: one pitch wide
     passes = _passes(chosen, places, lines, n_passes=n_passes, rng=rng)
     return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
+
+
+def stage_targets(artifact: Artifact, view: View, visits: VisitSequence,
+                  sense: Sense) -> np.ndarray:
+    """Return the stage position at which the mark of each visit is on the axis, (2, V), m.
+
+    Without `VisitSequence.aside_m`, if plate and stage were perfect.
+    """
+    if not len(visits):  # also a view of lines alone, at any turn
+        return np.zeros((2, 0))
+    places = artifact.places(visits.m, visits.n)
+    site = np.stack(view.on_stage(artifact).site_of(*places)) * artifact.grid_pitch_m
+    return -site if sense is Sense.PLATE_MOVES else site
+
+
+def line_targets(artifact: Artifact, view: View, sense: Sense, *,
+                 consecutive: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return line and angle of the stage of each exposure of the angular lines of a view.
+
+    Parameters
+    ----------
+    artifact, view
+        The plate, its pose, and the repeats.
+    sense : Sense
+        What moves.
+    consecutive : bool
+        All repeats of a line one after another; if false, one pass per repeat.
+
+    Returns
+    -------
+    k : int array (E,)
+        The line.
+    theta : float array (E,)
+        Angle of the stage, within one turn, rad.
+    """
+    count = artifact.angular_count
+    line = np.arange(count)
+    turn = (line + view.on_stage(artifact).s) % count if count else np.zeros(0)
+    nominal = turn * (2 * np.pi / count) if count else turn
+    centre = -nominal if sense is Sense.PLATE_MOVES else nominal
+    k = np.repeat(line, view.repeats) if consecutive else np.tile(line, view.repeats)
+    return k, centre[k]
 
 
 def _passes(order: VisitOrder, places: np.ndarray, lines: np.ndarray, *, n_passes: int,

@@ -13,7 +13,13 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kin
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View, parse_order
-from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
+from selfcal_ros.model.visit_order import (
+    VisitSequence,
+    approach_signs,
+    line_targets,
+    stage_targets,
+    visit_sequence,
+)
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.units import NS_PER_S
@@ -137,8 +143,6 @@ class GridExposures:
         Whether there is a mark.
     approach : int8 array (2, V)
         Sign of the last motion of each stage axis before the visit.
-    site : float array (2, V)
-        Nominal position of the mark in the stage frame, m.
     others : tuple of Seen
         What the other cells of the image show, in their order.
     """
@@ -150,7 +154,6 @@ class GridExposures:
     mark: np.ndarray
     there: np.ndarray
     approach: np.ndarray
-    site: np.ndarray
     others: tuple["Seen", ...] = ()
 
 
@@ -195,14 +198,12 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     size = len(visit)
     m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
     place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
-    places = truth.artifact.places(visits.m, visits.n)
-    site = np.stack(view.on_stage(truth.artifact).site_of(*places)) * truth.artifact.grid_pitch_m
     tau = np.arange(size) / max(size - 1, 1)
     moved = physics.drift(truth, index, tau)
-    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
-    stop = sign * site
+    stop = stage_targets(truth.artifact, view, visits, settings.sense)
     if settings.follow_mark:  # the stage continues until the mark is under the microscope
-        centre = sign * (place + moved[:, np.cumsum(visits.count) - visits.count])
+        centre = place + moved[:, np.cumsum(visits.count) - visits.count]
+        centre = -centre if settings.sense is Sense.PLATE_MOVES else centre
         stop = centre + physics.stage_error(truth, centre, index)
     stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
     came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
@@ -228,7 +229,7 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
                 beside + _white(rng, settings, size) + shared, settings.resolution_xy_m),
                 np.stack(marks[:2]), there & marks[2]))
     return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
-                         np.stack([m, n]), there, approach, site, tuple(others))
+                         np.stack([m, n]), there, approach, tuple(others))
 
 
 def _white(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
@@ -246,18 +247,16 @@ def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
 def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
                       rng: np.random.Generator) -> AngularExposures:
     """Return the exposures of the angular lines of view `index`, line by line."""
-    direction, nominal, there = physics.line_directions(truth, index, view)
-    line = np.arange(len(nominal))
-    k = (np.repeat(line, view.repeats) if settings.consecutive
-         else np.tile(line, view.repeats))
-    sign = -1 if settings.sense is Sense.PLATE_MOVES else 1
-    n_stops = len(line) if settings.consecutive else len(k)
+    direction, _, there = physics.line_directions(truth, index, view)
+    k, target = line_targets(truth.artifact, view, settings.sense,
+                             consecutive=settings.consecutive)
+    n_stops = len(direction) if settings.consecutive else len(k)
     stop = _normal(rng, settings.stop_sigma_theta_rad, n_stops)
     stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
-    centre = sign * nominal
     if settings.follow_mark:
-        centre = sign * direction + physics.encoder_error(truth, sign * direction)
-    position = centre[k] + stop + _normal(rng, settings.servo_sigma_theta_rad, len(k))
+        centre = direction if settings.sense is Sense.MICROSCOPE_MOVES else -direction
+        target = (centre + physics.encoder_error(truth, centre))[k]
+    position = target + stop + _normal(rng, settings.servo_sigma_theta_rad, len(k))
     stage = position - physics.encoder_error(truth, position)
     offset = physics.true_offset(settings.sense, direction[k], stage)
     told = (truth.line_factor * offset + _normal(rng, settings.sigma_theta_rad, len(k))

@@ -87,6 +87,10 @@ class ImageDetector:
         """Return the detections of an image file exposed at `stamp`, ns; raises like `take`."""
         return self._detect(partial(decoded, data, name), stamp, name)
 
+    def take_picture(self, picture: Picture, stamp: int) -> list[Detection]:
+        """Return the detections of grey values exposed at `stamp`, ns; raises like `take`."""
+        return self._detect(lambda check: picture, stamp, "image")
+
     def _detect(self, decode: Callable[[Check], Picture], stamp: int, name: str, *,
                 camera: str = "") -> list[Detection]:
         try:

@@ -10,6 +10,7 @@ from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.visit_order import stage_targets
 from selfcal_ros.papers import readings as white
 from selfcal_ros.papers.readings import angular_deviation, grid_deviation, hu_plan
 from selfcal_ros.simulation import cell
@@ -148,7 +149,8 @@ def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
     number = np.cumsum(kept) - 1  # index of a visit among those kept
     here = kept[found.visit]
     visit = number[found.visit[here]]
-    deviation = (_read(settings.sense, found) - found.site[:, found.visit])[:, here]
+    site = stage_targets(artifact, readings.view, visits, Sense.MICROSCOPE_MOVES)
+    deviation = (_read(settings.sense, found) - site[:, found.visit])[:, here]
     count, of_mark = visits.count[kept], mark[visit]
     by_visit, sigma_visit, dof_visit = _means(deviation, visit, count)
     readings_of = np.bincount(mark, count).astype(int)

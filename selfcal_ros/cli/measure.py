@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal measure``: a plan measured by a machine without ROS, from the plate to the report."""
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import TextIO
+
+from selfcal_ros.cli import solve
+from selfcal_ros.cli.terminal import add_json, aside
+from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.collection.inputs import Command
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.errors import InputError
+from selfcal_ros.machine.cell import open_machine, read_cell
+from selfcal_ros.machine.interface import MachineError
+from selfcal_ros.machine.measuring import Run
+from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
+from selfcal_ros.units import MM_PER_M, NM_PER_M
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.description = (
+        "Leads through the views of a plan: says how the plate is to be placed, moves the stage "
+        "after a yes, shows coverage, noise and rejections, saves every exposure at once, and "
+        "solves at the end. Ctrl-C stops the stage; --resume continues.")
+    parser.add_argument("plan", metavar="PLAN.yaml", help="plan with plate and views")
+    parser.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector "
+                        "(docs/machines.md)")
+    parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
+                        "create; the result is written beside it, BAG.json and BAG.html")
+    parser.add_argument("--yes", action="store_true", help="ask nothing: the plate is placed by a "
+                        "robot or a simulation, and the stage may move")
+    parser.add_argument("--resume", action="store_true", help="continue the bag of a run that was "
+                        "interrupted")
+    add_json(parser, "RESULT.json, and all else on stderr")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, solve, report."""
+    plan, cell = read_plan(args.plan), read_cell(args.cell)
+    bag = Path(args.output)
+    desk = Terminal(args.yes, bag, aside(args))
+    if not args.yes and not sys.stdin.isatty():
+        raise InputError("stdin", "there is nobody to ask: it is not a terminal",
+                         "give --yes where a robot or a simulation places the plate")
+    if args.yes and cell.placing == "person":
+        raise InputError(f"{cell.path}: placing", "--yes, but a person places the plate",
+                         "write placing: robot, or leave out --yes")
+    machine = open_machine(cell)
+    try:
+        work = Run(plan, cell, machine, bag, desk)
+        work.require()
+        work.measure(resume=args.resume)
+    except MachineError as error:
+        desk.end()
+        kept = "; what was measured is kept, --resume continues" if bag.exists() else ""
+        raise InputError(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
+    except KeyboardInterrupt:
+        machine.stop()
+        desk.end()
+        print(f"selfcal measure: stopped; {bag} is kept, --resume continues", file=sys.stderr)
+        raise
+    finally:
+        machine.close()
+    desk.end()
+    parser = argparse.ArgumentParser()
+    solve.configure(parser)
+    solving = parser.parse_args([str(bag), "-o", f"{bag}.json", "--sense", str(cell.sense),
+                                 "--report", f"{bag}.html"])
+    solving.verb = "measure"
+    solving.json = args.json
+    return solve.run(solving)
+
+
+class Terminal:
+    """The person at the terminal; with `is_silent` everything is answered with yes.
+
+    Parameters
+    ----------
+    is_silent : bool
+        Ask nothing.
+    bag : Path
+        The bag; pictures of the placements are written beside it.
+    stream : TextIO
+        Where everything is printed.
+    """
+
+    def __init__(self, is_silent: bool, bag: Path, stream: TextIO) -> None:
+        self._is_silent, self._bag, self._stream = is_silent, bag, stream
+        self._is_open = False  # a line is drawn that the next one overwrites
+
+    def place(self, command: Command) -> None:
+        """Say how the plate is to lie, with a picture, and wait."""
+        from selfcal_ros.reporting.figures.paper import save_picture  # matplotlib, a second
+        from selfcal_ros.reporting.figures.places import plan_figure  # with numbers of results
+
+        view = command.placed()
+        x, y = (value * MM_PER_M for value in view.translation_m)
+        picture = f"{self._bag}.placing.png"
+        save_picture(plan_figure(command.plate(), [view]), picture)
+        turn = math.degrees(view.rotation_rad)
+        self.say(f"place the plate: turned by {turn:g}° counter-clockwise, its centre at "
+                 f"({x:g}, {y:g}) mm from the centre of the field ({picture})")
+        self._ask("Enter when it lies there: ")
+
+    def may_move(self, text: str) -> bool:
+        """Ask."""
+        return self._is_silent or self._ask(f"{text} [y/N] ").lower() in ("y", "yes")
+
+    def lies_still(self, view: str) -> bool:
+        """Ask."""
+        if self._is_silent:
+            return True
+        return self._ask(f"view '{view}' was interrupted: does the plate lie as it did? [y/N] "
+                         ).lower() in ("y", "yes")
+
+    def _ask(self, text: str) -> str:
+        self.end()
+        if self._is_silent:
+            return ""
+        try:
+            print(text, end="", file=self._stream, flush=True)
+            return input().strip()
+        except EOFError:
+            raise KeyboardInterrupt from None
+
+    def show(self, progress: ViewProgress) -> None:
+        """Show coverage, noise and rejections in one line."""
+        line = progress_line(progress)
+        if self._stream.isatty():
+            print(f"\r\x1b[2K{line[:100]}", end="", file=self._stream, flush=True)
+            self._is_open = True
+        elif progress.complete:
+            self.say(line)
+
+    def say(self, line: str) -> None:
+        """Show a line."""
+        self.end()
+        print(line if can_print_symbols(self._stream) else to_ascii(line), file=self._stream)
+
+    def end(self) -> None:
+        """Leave the line that is overwritten."""
+        if self._is_open:
+            print(file=self._stream)
+        self._is_open = False
+
+
+def progress_line(progress: ViewProgress) -> str:
+    """Return how far a view is, in one line."""
+    readings = progress.readings
+    parts = [f"{progress.grid_done} of {progress.grid_expected} marks"]
+    if progress.angular_expected:
+        parts.append(f"{progress.angular_done} of {progress.angular_expected} lines")
+    rejected = sum(readings.rejected.values())
+    if rejected:
+        reasons = sorted(readings.rejected.items(), key=lambda item: -item[1])
+        parts.append(f"{rejected} rejected ({', '.join(f'{name} {n}' for name, n in reasons)})")
+    if math.isfinite(readings.sigma_xy):
+        parts.append(f"noise {readings.sigma_xy * NM_PER_M:.3g} nm")
+    return f"  {100 * progress.coverage:3.0f} %  " + ", ".join(parts)

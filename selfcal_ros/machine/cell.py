@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CELL.yaml: a machine, its limits, how it settles, its detector, and who places the plate."""
+
+import importlib
+import importlib.metadata
+import inspect
+import math
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, cast
+
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.parameter import Parameter
+from selfcal_ros.errors import InputError, did_you_mean, first_line, known_are
+from selfcal_ros.files import read_text, read_yaml
+from selfcal_ros.machine.interface import Machine, MachineError
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.outputs import write_text
+
+AXES = ("x", "y", "theta")
+ENTRY_POINTS = "selfcal.machines"
+SHIPPED = {
+    "simulated": "selfcal_ros.machine.simulated:SimulatedMachine",
+}
+"""Machines of this package; further ones are entry points of the group ``selfcal.machines``."""
+PLACERS = ("person", "robot")
+NOT_OF_A_CELL = ("autostart", "hardware_id", "transport", "max_waiting", "frame_id")
+"""Parameters of the node mark_detector that a cell does not have."""
+
+
+@dataclass(frozen=True)
+class Settle:
+    """When the stage is at rest at its target; lengths in m, times in s, angles in rad.
+
+    Attributes
+    ----------
+    time : float
+        Waiting time after every move.
+    within, within_theta : float
+        Largest difference of two successive readings at rest.
+    arrival, arrival_theta : float
+        Largest distance of the indicated position from the commanded one.
+    patience : float
+        Longest wait for rest.
+    """
+
+    time: float = 0.0
+    within: float = 1e-6
+    within_theta: float = 1e-5
+    arrival: float = 2e-5
+    arrival_theta: float = 1e-3
+    patience: float = 10.0
+
+    def of(self, axis: str, name: str) -> float:
+        """Return `within` or `arrival` of an axis."""
+        return float(getattr(self, f"{name}_theta" if axis == "theta" else name))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A parsed CELL.yaml.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    machine : str
+        Name of the machine, or ``package.module:Class``.
+    keys : mapping
+        The machine's own keys.
+    limits : mapping
+        Axis -> (low, high) of the machine's position, never left.
+    origin : mapping
+        Axis -> machine's position at the centre of the field.
+    sense : Sense
+        What moves.
+    settle : Settle
+        When the stage is at rest.
+    detector : DetectorSettings or None
+        How marks are found in images; None without.
+    placing : str
+        ``person`` or ``robot``; with `place_command` a program is the robot.
+    place_command : str
+        Command line with {view}, {x}, {y}, {rotation}; empty = the machine's method ``place``.
+    """
+
+    path: Path
+    machine: str
+    keys: Mapping[str, Any]
+    limits: Mapping[str, tuple[float, float]]
+    origin: Mapping[str, float] = field(default_factory=dict)
+    sense: Sense = Sense.MICROSCOPE_MOVES
+    settle: Settle = Settle()
+    detector: DetectorSettings | None = None
+    placing: str = "person"
+    place_command: str = ""
+
+    @property
+    def name(self) -> str:
+        """The key under which the machine's own keys stand."""
+        return self.machine.rpartition(":")[2]
+
+    def to_machine(self, axis: str, value: float) -> float:
+        """Return the machine's position of a position in the stage frame."""
+        return value + self.origin.get(axis, 0.0)
+
+    def to_stage(self, axis: str, value: float) -> float:
+        """Return the position in the stage frame of a machine's position."""
+        return value - self.origin.get(axis, 0.0)
+
+    def require_limits(self, axis: str, value: float, what: str) -> None:
+        """Raise MachineError for a machine's position that is not a number or leaves the limits."""
+        if not math.isfinite(value):
+            raise MachineError(f"{what}: {axis} = {value} is not a position", str(self.path))
+        if axis not in self.limits:
+            raise MachineError(f"{what} moves {axis}, which has no limits", f"{self.path}: limits",
+                               f"give limits: {{{axis}: [low, high]}}")
+        low, high = self.limits[axis]
+        if not low <= value <= high:
+            raise MachineError(
+                f"{what} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
+                f"{self.path}: limits", "correct limits or origin, or take a smaller plan")
+
+
+def read_cell(path: str | Path) -> Cell:
+    """Return the cell in a CELL.yaml.
+
+    Raises
+    ------
+    InputError
+        For an unknown key, a wrong type or a value that cannot be.
+    """
+    path = Path(path)
+    where = str(path)
+    data = _mapping(read_yaml(path), where)
+    if not isinstance(data.get("machine"), str):
+        raise InputError(where, "the key 'machine' is missing", "name a machine: "
+                         f"{', '.join(known_machines())}, or package.module:Class")
+    machine = data["machine"]
+    own = machine.rpartition(":")[2]
+    known = ("machine", own, "limits", "origin", "sense", "settle", "detector", "placing", "found")
+    _only(data, known, where)
+    limits = {}
+    for axis, pair in _mapping(data.get("limits", {}), f"{where}: limits").items():
+        limits[axis] = _pair(pair, f"{where}: limits: {axis}")
+    _only(limits, AXES, f"{where}: limits")
+    for axis in ("x", "y"):
+        if axis not in limits:
+            raise InputError(f"{where}: limits", f"the travel of {axis} is not limited",
+                             f"give {axis}: [low, high] in m, as the machine indicates them")
+    sense = Parameter("sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense)))
+    found = _mapping(data.get("placing") if isinstance(data.get("placing"), dict) else {}, where)
+    _only(found, ("command",), f"{where}: placing")
+    placing = "robot" if found else Parameter("placing", "person", "", choices=PLACERS).check(
+        data.get("placing", "person"), where)
+    return Cell(
+        path, machine, _mapping(data.get(own, {}), f"{where}: {own}"), limits,
+        origin=_numbers(data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)),
+        sense=Sense(sense.check(data.get("sense", sense.default), where)),
+        settle=Settle(**_numbers(data.get("settle", {}), f"{where}: settle", {
+            item.name: getattr(Settle(), item.name) for item in fields(Settle)}, low=0.0)),
+        detector=_detector(data["detector"], where) if "detector" in data else None,
+        placing=placing, place_command=str(found.get("command", "")))
+
+
+def _detector(data: Any, where: str) -> DetectorSettings:
+    section = _mapping(data, f"{where}: detector")
+    names = [item.name for item in DetectorSettings.parameters() if item.name not in NOT_OF_A_CELL]
+    _only(section, names, f"{where}: detector")
+    return DetectorSettings.checked(section, f"{where}: detector")
+
+
+def _mapping(data: Any, where: str) -> dict[str, Any]:
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise InputError(where, "not a mapping", "see docs/machines.md")
+    return data
+
+
+def _only(data: Mapping[str, Any], known: Any, where: str) -> None:
+    for key in data:
+        if key not in known:
+            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
+
+
+def _numbers(data: Any, where: str, defaults: Mapping[str, float], low: float | None = None,
+             ) -> dict[str, float]:
+    section = _mapping(data, where)
+    _only(section, defaults, where)
+    return {name: Parameter(name, float(defaults[name]), "", low=low).check(value, where)
+            for name, value in section.items()}
+
+
+def _pair(value: Any, where: str) -> tuple[float, float]:
+    numbers = [item for item in value if isinstance(item, int | float)] if isinstance(
+        value, list) else []
+    if len(numbers) != 2 or not numbers[0] < numbers[1]:
+        raise InputError(where, f"{value!r} is not [low, high]", "give two rising numbers, SI")
+    return float(numbers[0]), float(numbers[1])
+
+
+def known_machines() -> dict[str, str]:
+    """Return name -> ``package.module:Class`` of all machines that have a name."""
+    others = importlib.metadata.entry_points(group=ENTRY_POINTS)
+    return {point.name: point.value for point in others} | SHIPPED
+
+
+def open_machine(cell: Cell) -> Machine:
+    """Return the machine of a cell, connected.
+
+    Raises
+    ------
+    InputError
+        If there is no such machine or module, its keys are wrong, or it is not a machine.
+    MachineError
+        If it cannot be reached.
+    """
+    kind = _class_of(cell)
+    _check_keys(kind, cell)
+    keys = dict(cell.keys)
+    if "folder" in inspect.signature(kind).parameters and "folder" not in keys:
+        keys["folder"] = str(cell.path.parent)
+    machine = kind(**keys)
+    for name in ("axes", "position", "move_to", "image", "offsets", "stop", "close"):
+        if not hasattr(machine, name):
+            raise InputError(f"{cell.path}: machine", f"{cell.machine} has no '{name}'",
+                             "give the class all that selfcal_ros.machine.Machine has")
+    axes = tuple(machine.axes)
+    if axes not in (AXES[:2], AXES):
+        raise InputError(f"{cell.path}: machine", f"the axes of {cell.machine} are {axes}",
+                         "let them be ('x', 'y') or ('x', 'y', 'theta')")
+    return cast(Machine, machine)
+
+
+def _class_of(cell: Cell) -> Any:
+    named = known_machines()
+    target = cell.machine if ":" in cell.machine else named.get(cell.machine, "")
+    where = f"{cell.path}: machine"
+    if not target:
+        hint = did_you_mean(cell.machine, named)
+        raise InputError(where, f"there is no machine '{cell.machine}'",
+                         f"{hint} known are {', '.join(sorted(named))}; or package.module:Class"
+                         .strip())
+    module, _, name = target.partition(":")
+    folder = str(cell.path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module.startswith(error.name):
+            raise InputError(where, f"'{cell.machine}' needs the module {error.name}",
+                             f"pip install 'selfcal_ros[{cell.machine}]'" if ":" not in
+                             cell.machine else f"install {error.name}") from error
+        raise InputError(where, f"there is no module '{module}'",
+                         f"put {module.partition('.')[0]}.py beside {cell.path.name}, or install "
+                         "it") from error
+    except Exception as error:
+        raise InputError(where, f"the module '{module}' fails: {type(error).__name__}: "
+                         f"{first_line(error)}", "correct it") from error
+    if not hasattr(found, name):
+        raise InputError(where, f"the module '{module}' has no '{name}'",
+                         known_are(name, [key for key in vars(found) if not key.startswith("_")]))
+    return getattr(found, name)
+
+
+def _check_keys(kind: Any, cell: Cell) -> None:
+    """Refuse keys that the class does not take, and missing ones."""
+    where = f"{cell.path}: {cell.name}"
+    parameters = {name: item for name, item in inspect.signature(kind).parameters.items()
+                  if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD)}
+    takes_any = len(parameters) < len(inspect.signature(kind).parameters)
+    if not takes_any:
+        _only(cell.keys, parameters, where)
+    missing = [name for name, item in parameters.items()
+               if item.default is item.empty and name not in cell.keys]
+    if missing:
+        raise InputError(where, f"the key '{missing[0]}' is missing",
+                         f"give {cell.name}: {{{missing[0]}: ...}}")
+
+
+def with_values(path: Path, section: str, values: Mapping[str, Any],
+                notes: Mapping[str, str]) -> None:
+    """Write values into a section of a CELL.yaml, in block style, and keep the rest as it is.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    section : str
+        Its section; keys that `values` does not have are kept.
+    values, notes : mapping
+        Key -> value, and the comment behind it.
+    """
+    text = read_text(path)
+    old = _mapping((read_yaml(path) or {}).get(section), f"{path}: {section}")
+    lines = [f"{section}:"]
+    for key, value in (old | dict(values)).items():
+        note = f"  # {notes[key]}" if key in notes else ""
+        lines.append(f"  {key}: {_as_yaml(value)}{note}")
+    block = "\n".join(lines) + "\n"
+    pattern = re.compile(rf"^{section}:.*\n(?:(?:[ \t].*)?\n)*", re.MULTILINE)
+    text = text if text.endswith("\n") else text + "\n"
+    replaced, count = pattern.subn(lambda _: block, text, count=1)
+    write_text(path, replaced if count else text + block)
+
+
+def _as_yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        text = repr(value)
+        return text if "." in text or "e" not in text else text.replace("e", ".0e")
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_as_yaml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_as_yaml, value)) + "]"
+    return str(value)

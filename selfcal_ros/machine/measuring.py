@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan measured by a machine without ROS: views in their order, saved as it goes, resumed.
+
+The bag is a journal: whatever happens, it has every exposure that was told, and can be read.
+"""
+
+import math
+import shlex
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from selfcal_ros.bagio.journal import Claim, Journal, create
+from selfcal_ros.bagio.offline import block_handlers
+from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.writer import cdr_bytes
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.checks.wiring import check_wiring
+from selfcal_ros.machine.cell import Cell
+from selfcal_ros.machine.clock import Clock
+from selfcal_ros.machine.interface import Machine, MachineError, Placing
+from selfcal_ros.machine.visiting import Again, Visitor, stops
+from selfcal_ros.messages import from_model
+from selfcal_ros.model.readings import placing_digest
+from selfcal_ros.model.view import Plan
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+    qos_profile,
+)
+from selfcal_ros.units import NS_PER_S, UM_PER_M
+
+FRAME = "stage"
+REVISITS = 3
+"""Rounds of revisits without a mark more, after which a view cannot be completed."""
+TELL_NS = NS_PER_S // 2
+"""Smallest time between two reports of the progress."""
+SHIFT_MARKS = 5
+"""Marks that are read again where a view is resumed."""
+SHIFT_SIGMAS = 6.0
+"""Shift of these marks, in standard deviations, from which the view is measured anew."""
+LEAST_SHIFT_M = 1e-7
+"""Smallest shift that counts."""
+NAMED = 5
+"""Number of missing marks that an error names."""
+
+
+class Desk(Protocol):
+    """The person at the machine, or whoever answers for them."""
+
+    def place(self, command: Command) -> None:
+        """Return when the plate lies as the view says."""
+        ...
+
+    def may_move(self, text: str) -> bool:
+        """Return whether the stage may move as the text says."""
+        ...
+
+    def lies_still(self, view: str) -> bool:
+        """Return whether the plate lies as it did when the view was interrupted."""
+        ...
+
+    def show(self, progress: ViewProgress) -> None:
+        """Show how far the view is."""
+        ...
+
+    def say(self, line: str) -> None:
+        """Show a line."""
+        ...
+
+
+@dataclass
+class Run:
+    """The measurement of a plan.
+
+    Parameters
+    ----------
+    plan, cell, machine
+        What is measured, and by what.
+    bag : Path
+        Bag folder to write.
+    desk : Desk
+        The person.
+    clock : Clock, optional
+        Stamps and waits.
+    """
+
+    plan: Plan
+    cell: Cell
+    machine: Machine
+    bag: Path
+    desk: Desk
+    clock: Clock = field(default_factory=Clock)
+
+    def __post_init__(self) -> None:
+        """Prepare; nothing is written or moved yet."""
+        self.visitor = Visitor(self.machine, self.cell, self.clock)
+        self.collector = Collector(collector_settings(self.cell))
+        self._sequencer = Sequencer(self.plan)
+        self._run_id, self._stamp_ns = "", 0
+        self._told_ns = 0
+        self._journal: Journal | None = None
+        self._resumed = False
+
+    def require(self) -> None:
+        """Refuse a plan that the machine cannot carry out, before anything moves.
+
+        Raises
+        ------
+        MachineError
+            If a stop is beyond the limits, or the machine lacks an axis or cannot place.
+        """
+        for view in self.plan.views:
+            route = stops(self.plan.artifact, replace(view, repeats=1, visit_order=""),
+                          self.cell.sense)
+            try:
+                self.visitor.require(route)
+            except MachineError as error:
+                raise MachineError(error.what, f"view '{view.name}': {error.where}",
+                                   error.remedy) from error
+        places = bool(self.cell.place_command) or hasattr(self.machine, "place")
+        if self.cell.placing == "robot" and not places:
+            raise MachineError("the machine has no method 'place'", f"{self.cell.path}: placing",
+                               "write placing: {command: 'PROGRAM {view} {x} {y} {rotation}'}, or "
+                               "placing: person")
+
+    def measure(self, *, resume: bool = False) -> None:
+        """Measure all views; return when the last one is complete.
+
+        Parameters
+        ----------
+        resume : bool
+            Continue the bag of an interrupted run, if there is one.
+
+        Raises
+        ------
+        InputError
+            If the bag exists, or is not of this plan.
+        MachineError
+            If the machine does not do as commanded; it was stopped, the bag is kept.
+        NoDataError
+            If marks are not seen; likewise.
+        """
+        commands = self._begin(resume)
+        try:
+            self._write_all(commands)
+            while self._sequencer.state not in ENDED:
+                if self._sequencer.state is State.PLACING:
+                    self._place()
+                    self._write_all(self._sequencer.confirm())
+                self._measure_view()
+        finally:
+            if self._journal is not None:
+                self._journal.close()
+
+    def _begin(self, resume: bool) -> list[Command]:
+        """Open the bag; return the commands to begin with."""
+        if not self.bag.exists():
+            self._journal = create(self.bag)
+            self._declare()
+            return self._sequencer.start()
+        if not resume:
+            raise InputError(str(self.bag), "exists already",
+                             "continue it with --resume, remove it, or name another folder")
+        return self._take_up()
+
+    def _declare(self) -> None:
+        assert self._journal is not None
+        for topic, typename in INPUT_TOPICS.items():
+            profile = qos_profile(reliable=True, transient_local=topic == COMMAND_TOPIC,
+                                  depth=64 if topic == COMMAND_TOPIC else 1000)
+            self._journal.add_topic(f"/{topic}", typename, [profile])
+
+    def _take_up(self) -> list[Command]:
+        """Continue an interrupted run where it stood; no commands if it is in the middle of one."""
+        where = str(self.bag)
+        if not any(self.bag.glob("*.mcap")):
+            raise InputError(where, "not a bag of an interrupted run",
+                             "remove it, or name another folder")
+        self._journal = Claim(self.bag).resume()
+        if self._journal is None:
+            self.desk.say(f"{where}: measured already")
+            return []
+        self._declare()
+        lost: list[str] = []
+        feed = block_handlers(self.collector, lost)
+        for topic, item in BagReader(self.bag).columns():
+            feed[topic](item)
+        last = self.collector.newest_command
+        if last is None:
+            return self._sequencer.start()
+        if last.plan_id != self.plan.plan_id or last.view_index >= len(self.plan.views) or (
+                last.view is None or last.artifact is None
+                or placing_digest(last.artifact, last.view) != placing_digest(
+                    self.plan.artifact, self.plan.views[last.view_index])):
+            raise InputError(where, f"the interrupted run is of another plan, '{last.plan_id}'",
+                             "name the same PLAN.yaml, unchanged, or another folder")
+        newest_ns = max(last.stamp_ns, self.collector.encoder_until_ns)
+        if self.clock.now_ns() <= newest_ns:
+            raise InputError(where, "this computer's clock is behind the last message of the bag",
+                             "set the clock")
+        self._run_id, self._stamp_ns = last.run_id, last.stamp_ns
+        self._resumed = True
+        self._sequencer.resume(last.view_index, last.phase)
+        name = self.plan.views[last.view_index].name
+        if last.phase == Phase.MEASURE and self.desk.lies_still(name):
+            return []
+        return self._sequencer.redo()
+
+    def _place(self) -> None:
+        """Have the plate placed; the stage does not move meanwhile."""
+        command = self._sequencer_command()
+        view = command.placed()
+        if self.cell.placing == "robot":
+            placing = Placing(view.name, view.translation_m[0], view.translation_m[1],
+                              view.rotation_rad, command)
+            place_by_robot(self.machine, self.cell, placing)
+        else:
+            self.desk.place(command)
+
+    def _sequencer_command(self) -> Command:
+        index = self._sequencer.index
+        return Command(self._stamp_ns, Phase.PLACE, self.plan.plan_id, index,
+                       self.plan.views[index], self.plan.artifact, len(self.plan.views),
+                       run_id=self._run_id)
+
+    def _write_all(self, commands: list[Command]) -> None:
+        for command in commands:
+            self._stamp_ns = max(self.clock.now_ns(), self._stamp_ns + 1)
+            self._run_id = self._run_id or str(self._stamp_ns)
+            self._write(replace(command, stamp_ns=self._stamp_ns, run_id=self._run_id))
+
+    def _write(self, event: Command | EncoderSample | Detection) -> None:
+        """Save a message, then use it."""
+        assert self._journal is not None
+        topic, fields = message_of(event)
+        self._journal.write(f"/{topic}", cdr_bytes(INPUT_TOPICS[topic], fields), event.stamp_ns)
+        self._journal.flush()
+        if isinstance(event, Command):
+            self.collector.add_command(event)
+        elif isinstance(event, Detection):
+            self.collector.add_detection(event)
+        else:
+            self.collector.add_encoder(event)
+
+    def _progress(self) -> ViewProgress:
+        return self.collector.collect()[1][self._sequencer.index]
+
+    def _measure_view(self) -> None:
+        """Measure the view that the plate lies for, until it is complete."""
+        index, number = self._sequencer.index, len(self.plan.views)
+        view = self.plan.views[index]
+        resumed, self._resumed = self._resumed, False
+        self.desk.say(f"view {index + 1} of {number} '{view.name}'")
+        if not self.desk.may_move("the stage makes a small move, then goes to its marks"):
+            raise InputError(f"view '{view.name}'", "the stage may not move",
+                             "continue with --resume")
+        self._check_first(view.grid)
+        if resumed and self._has_shifted():
+            self._write_all(self._sequencer.redo())
+            return
+        if not resumed:
+            self._visit(None)
+        left, rounds = math.inf, 0
+        progress = self._progress()
+        while not progress.complete:
+            rounds = rounds + 1 if progress.needed >= left else 0
+            left = progress.needed
+            if rounds >= REVISITS:
+                raise NoDataError(f"view '{view.name}'", f"{_named(progress)} are not read after "
+                                  f"{rounds} more visits{_rejected(progress)}",
+                                  "clean the plate there, check light and focus, or leave these "
+                                  "marks out of the plan; --resume continues")
+            missing = progress.missing
+            self._visit(Again({*zip(missing.m, missing.n, strict=True)}, {*missing.k},
+                              progress.check_done < progress.check_expected))
+            progress = self._progress()
+        self.desk.show(progress)
+        measurements, _ = self.collector.collect()
+        check_wiring(measurements)
+        self._write_all(self._sequencer.status(self.plan.plan_id, index, True))
+
+    def _check_first(self, grid: bool) -> None:
+        """Go to the first mark of the view and make the small first move there."""
+        if grid:
+            route = stops(self.plan.artifact, self.plan.views[self._sequencer.index],
+                          self.cell.sense)
+            self.visitor.go(route[0].target)
+        self.visitor.first_move(marks=grid)
+
+    def _visit(self, again: Again | None) -> None:
+        """Visit marks of the view, save what is seen, show the progress from time to time."""
+        view = self.plan.views[self._sequencer.index]
+        for event in self.visitor.view(self.plan.artifact, view, again):
+            self._write(event)
+            if event.stamp_ns - self._told_ns >= TELL_NS:
+                self._told_ns = event.stamp_ns
+                self.desk.show(self._progress())
+
+    def _has_shifted(self) -> bool:
+        """Return whether plate or stage have shifted since the view was interrupted.
+
+        A few of its marks are read again: after a power cut a stage may have lost its zero.
+        """
+        progress = self._progress()
+        readings, view = progress.readings, progress.view
+        if not len(readings.m):
+            return False
+        some = np.linspace(0, len(readings.m) - 1, min(SHIFT_MARKS, len(readings.m))).astype(int)
+        marks = [(int(readings.m[row]), int(readings.n[row])) for row in some]
+        before = {mark: (readings.dx[row], readings.dy[row])
+                  for mark, row in zip(marks, some, strict=True)}
+        again = Collector(collector_settings(self.cell))
+        command = self.collector.newest_command
+        assert command is not None
+        again.add_command(replace(command, view=replace(view, repeats=1)))
+        for event in self.visitor.view(self.plan.artifact, view, Again(marks)):
+            if isinstance(event, Detection):
+                again.add_detection(event)
+            else:
+                again.add_encoder(event)
+        found = again.collect()[1][progress.view_index].readings
+        shift = np.array([[x - before[m, n][0], y - before[m, n][1]] for m, n, x, y in zip(
+            found.m.tolist(), found.n.tolist(), found.dx, found.dy, strict=True)
+            if (m, n) in before])
+        if not len(shift):
+            return False
+        sigma = readings.sigma_xy if math.isfinite(readings.sigma_xy) else 0.0
+        limit = max(LEAST_SHIFT_M, SHIFT_SIGMAS * sigma * math.sqrt(1 + 1 / len(shift)))
+        x, y = np.median(shift, axis=0)
+        if math.hypot(x, y) <= limit:
+            return False
+        self.desk.say(f"view '{view.name}': its marks lie {x * UM_PER_M:+.3g}, "
+                      f"{y * UM_PER_M:+.3g} um from where they were: the plate was moved, or the "
+                      "stage has another zero; the view is measured anew")
+        return True
+
+
+def collector_settings(cell: Cell) -> CollectorSettings:
+    """Return the parameters with which the readings of a cell are collected."""
+    return CollectorSettings.checked({"measurement_sense": str(cell.sense)}, str(cell.path))
+
+
+def message_of(event: Command | EncoderSample | Detection) -> tuple[str, dict[str, Any]]:
+    """Return topic and fields of a message of a cell."""
+    if isinstance(event, Command):
+        return COMMAND_TOPIC, from_model.command(event, FRAME)
+    if isinstance(event, Detection):
+        return DETECTION_TOPIC, from_model.detection(event, FRAME)
+    return ENCODER_TOPIC, from_model.joint_state(event, FRAME)
+
+
+def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
+    """Have the plate placed by the cell's program, or by the machine itself.
+
+    Raises
+    ------
+    MachineError
+        If the program fails, or there is nobody to place.
+    """
+    if not cell.place_command:
+        place: Callable[[Placing], None] | None = getattr(machine, "place", None)
+        if place is None:
+            raise MachineError("the machine has no method 'place'", f"{cell.path}: placing",
+                               "name a command")
+        place(placing)
+        return
+    words = [word.format(view=placing.view, x=repr(placing.x), y=repr(placing.y),
+                         rotation=repr(placing.rotation))
+             for word in shlex.split(cell.place_command)]
+    try:
+        done = subprocess.run(words, cwd=cell.path.parent, check=False, capture_output=True,
+                              text=True)
+    except OSError as error:
+        raise MachineError(f"{words[0]} cannot be run ({error.strerror})",
+                           f"{cell.path}: placing") from error
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or [""])[-1]
+        raise MachineError(f"{words[0]} ended with {done.returncode}: {last}",
+                           f"{cell.path}: placing", "the plate is not placed; --resume continues")
+
+
+def _named(progress: ViewProgress) -> str:
+    missing = progress.missing
+    marks = [f"mark ({m}, {n})" for m, n in zip(missing.m, missing.n, strict=True)]
+    names = [*marks, *(f"line {k}" for k in missing.k)]
+    if not names:
+        return "check stops"
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _rejected(progress: ViewProgress) -> str:
+    found = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[:3]
+    return f" (rejected: {', '.join(f'{name} {count}' for name, count in found)})" if found else ""
+
+

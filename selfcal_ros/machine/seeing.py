@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a machine sees: images or offsets into detections; images that cannot be trusted."""
+
+import numpy as np
+
+from selfcal_ros.collection.inputs import Detection, Kind
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.machine.interface import Image, MachineError, Offset
+from selfcal_ros.vision.exposures import ImageDetector
+from selfcal_ros.vision.images import Picture
+
+SATURATED = 0.5
+"""Part of saturated pixels from which an image is refused."""
+LEAST_RANGE = 0.01
+"""Range of grey values over the full scale below which an image is black, or blank."""
+MOVED_M = 1e-6
+"""Smallest motion between two images that cannot be identical."""
+
+
+class Eye:
+    """Turns what a machine shows into detections.
+
+    Parameters
+    ----------
+    settings : DetectorSettings or None
+        How marks are found in images; None = the machine detects by itself.
+    where : str
+        Place of the settings, for errors.
+    """
+
+    def __init__(self, settings: DetectorSettings | None, where: str) -> None:
+        self._settings, self._where = settings, where
+        self._detector: ImageDetector | None = None
+        self._before: tuple[np.ndarray, tuple[float, ...]] | None = None
+        self.newest: np.ndarray | None = None
+
+    @property
+    def why(self) -> str:
+        """What the detector rejected, to be appended to a sentence."""
+        counts = self._detector.counts if self._detector else None
+        if counts is None or not counts.rejected:
+            return ""
+        return " (rejected: " + ", ".join(
+            f"{reason} {count}" for reason, count in counts.rejected.most_common(3)) + ")"
+
+    def detections(self, shown: Image | list[Offset], stamp_ns: int,
+                   position: tuple[float, ...]) -> list[Detection]:
+        """Return the detections in an image or of offsets.
+
+        Parameters
+        ----------
+        shown : Image or list of Offset
+            What the machine returned.
+        stamp_ns : int
+            Its instant, unless it has its own.
+        position : tuple of float
+            The position of the stage, m and rad.
+
+        Raises
+        ------
+        MachineError
+            If the image is not one, is the last one again, black, or saturated.
+        InputError
+            If the cell has no detector for it.
+        """
+        if isinstance(shown, Image):
+            picture = self._picture(shown, position)
+            return self._of_images().take_picture(picture, shown.stamp_ns or stamp_ns)
+        return [_detection(offset, stamp_ns) for offset in shown]
+
+    def _of_images(self) -> ImageDetector:
+        if self._detector is None:
+            if self._settings is None:
+                raise InputError(f"{self._where}: detector", "the machine returns images, and how "
+                                 "marks are found in them is not stated",
+                                 "give detector: {mark: disc, mark_size: ...}, in m")
+            self._detector = ImageDetector(self._settings, f"{self._where}: detector")
+        return self._detector
+
+    def _picture(self, image: Image, position: tuple[float, ...]) -> Picture:
+        """Return the grey values of an image that can be trusted."""
+        pixels = np.asarray(image.pixels)
+        if pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
+            raise MachineError(f"an image is {pixels.dtype} {pixels.shape}", "machine.image",
+                               "return grey values (h, w), uint8 or uint16")
+        full = (self._settings.full_scale if self._settings else 0) or int(
+            np.iinfo(pixels.dtype).max)
+        last, self._before = self._before, (pixels.copy(), position)
+        self.newest = self._before[0]
+        if last is not None and np.array_equal(last[0], pixels) and np.abs(np.subtract(
+                last[1][:2], position[:2])).max() > MOVED_M:
+            raise MachineError("the camera returns the last image again after a move",
+                               "machine.image", "let it expose anew for every image")
+        if (pixels >= full).mean() > SATURATED:
+            raise MachineError("the image is saturated", "machine.image",
+                               "shorten the exposure, or reduce the light")
+        if float(pixels.max()) - float(pixels.min()) < LEAST_RANGE * full:
+            shade = "black" if pixels.max() < 0.1 * full else "blank"
+            raise MachineError(f"the image is {shade}", "machine.image",
+                               "check light, shutter, lens cap and exposure time")
+        return Picture(pixels, int(np.iinfo(pixels.dtype).max))
+
+
+def _detection(offset: Offset, stamp_ns: int) -> Detection:
+    m, n = offset.mark or (0, 0)
+    is_line = offset.theta is not None
+    return Detection(
+        offset.stamp_ns or stamp_ns, int(Kind.ANGULAR if is_line else Kind.GRID),
+        (offset.line if is_line else offset.mark) is not None, int(m), int(n),
+        int(offset.line or 0), float(offset.x), float(offset.y), float(offset.theta or 0.0),
+        float(offset.sigma), float(offset.score))

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan measured without ROS: the map, the bag, faults, and what is left after them."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.bagio.offline import collect_bag
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.machine import MachineError
+from selfcal_ros.machine.measuring import Run, collector_settings
+from test.support.cells import CELL, PLAN, SIMULATION, Agreeing, Jumping, Spoilt, write_cell
+
+
+def run_of(folder, machine, cell, clock=None, desk=None) -> Run:
+    return Run(read_plan(folder / "plan.yaml"), cell, machine, folder / "bag", desk or Agreeing(),
+               clock or Jumping())
+
+
+def away_from(truth, bag, settings=None) -> tuple[np.ndarray, object]:
+    """Return found minus true map after removal of the datum, (2 n,), and the result."""
+    measurements = collect_bag(bag, settings or CollectorSettings()).measurements
+    result = calibrate(measurements)
+    sites = result.error_map.artifact.field
+    x, y = sites.x_m.ravel(), sites.y_m.ravel()
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    columns = np.array([[*one, *zero], [*zero, *one], [*-y, *x], [*x, *y]]).T
+    away = np.concatenate([result.error_map.gx.ravel() - truth.g[0].ravel(),
+                           result.error_map.gy.ravel() - truth.g[1].ravel()])
+    return away - columns @ np.linalg.lstsq(columns, away, rcond=None)[0], result
+
+
+@pytest.mark.parametrize("camera", [False, True])
+@pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
+def test_the_map_is_right_within_its_uncertainty(tmp_path, camera, sense):
+    cell, machine = write_cell(
+        tmp_path, camera=camera, cell=f"{CELL}sense: {sense}\norigin: {{x: 0.0005}}\n",
+        simulation=f"{SIMULATION}cell: {{sense: {sense}}}\n")
+    machine._position[0] = 0.0005
+
+    class Shifted(Spoilt):
+        """The origin of its axes is not the centre of the field."""
+
+        def position(self):
+            x, *others = super().position()
+            return (x + 0.0005, *others)
+
+        def move_to(self, position):
+            super().move_to((position[0] - 0.0005, *position[1:]))
+
+    run_of(tmp_path, Shifted(machine), cell).measure()
+    away, result = away_from(machine.truth, tmp_path / "bag", collector_settings(cell))
+    u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
+    assert result.verdict.qualified
+    assert np.abs(away).max() < 4 * u.max() < 1e-7
+    assert np.abs(machine.truth.g).max() > 2e-7
+
+
+FAULTS = [
+    ("lost connection", "the connection was lost"), ("frozen position", "was sent to"),
+    ("never at rest", "does not come to rest"), ("limit switch", "x was sent to"),
+    ("no number", "its position is"), ("stands still", "was sent to"),
+    ("last image again", "returns the last image again"), ("black", "the image is black"),
+    ("saturated", "the image is saturated"), ("colour", "an image is uint8"),
+    ("future stamp", "the stamp of an exposure")]
+
+
+@pytest.mark.parametrize(("fault", "said"), FAULTS)
+def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
+        tmp_path, fault, said):
+    cell, machine = write_cell(tmp_path, camera=True)
+    spoilt = Spoilt(machine, fault, after=16)
+    with pytest.raises(MachineError, match=said):
+        run_of(tmp_path, spoilt, cell).measure()
+    assert spoilt.stops >= 1
+    if fault != "limit switch":  # the others are noticed at the next stop but one
+        assert len(spoilt.moves) <= 18
+    readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
+    n_seen = sum(int(view.count.sum()) for view in readings.views)
+    assert n_seen >= 9
+    run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12)).measure(resume=True)
+    away, result = away_from(machine.truth, tmp_path / "bag")
+    assert result.verdict.qualified
+    assert np.abs(away).max() < 5e-8
+
+
+AT_FIRST = [
+    ("position in mm", "1e+03 times as far: is it mm for m?"),
+    ("indicates exchanged axes", "y moved instead: the axes are exchanged"),
+    ("indicates reversed x", "the opposite direction: x is reversed"),
+    ("frozen position", "nothing moved: its position is frozen"),
+    ("late by one frame", "the image is late by one frame"),
+    ("mirrored camera", "the opposite direction: x is reversed")]
+
+
+@pytest.mark.parametrize(("fault", "said"), AT_FIRST)
+def test_the_first_small_move_names_what_is_wrong(tmp_path, fault, said):
+    cell, machine = write_cell(tmp_path, camera=True)
+    spoilt = Spoilt(machine, fault)
+    visitor = run_of(tmp_path, spoilt, cell).visitor
+    with pytest.raises(MachineError) as error:
+        visitor.first_move(marks=True)
+    assert said in str(error.value)
+    assert np.abs(np.array(spoilt.moves)[:, :2]).max() <= 51e-6
+
+
+def test_nothing_moves_beyond_the_limits(tmp_path):
+    cell, machine = write_cell(tmp_path, plan=PLAN.replace("0.001", "0.0101"))
+    spoilt = Spoilt(machine)
+    run = run_of(tmp_path, spoilt, cell)
+    with pytest.raises(MachineError, match=r"view 'identity'.*beyond the limits -0.01 to 0.01"):
+        run.require()
+    assert not spoilt.moves
+
+
+def test_a_view_of_lines_needs_a_rotary_axis(tmp_path):
+    cell, machine = write_cell(tmp_path, plan=PLAN.replace("angular_count: 0", "angular_count: 8"))
+    spoilt = Spoilt(machine)
+    spoilt.axes = ("x", "y")
+    with pytest.raises(MachineError, match="the view moves theta, the machine has x and y"):
+        run_of(tmp_path, spoilt, cell).require()
+
+
+def test_nothing_moves_while_the_plate_is_placed(tmp_path):
+    cell, machine = write_cell(tmp_path, cell=CELL.replace("robot", "person"))
+    spoilt = Spoilt(machine)
+    moves_at = []
+
+    class Placing(Agreeing):
+        def place(self, command):
+            moves_at.append(len(spoilt.moves))
+
+        def may_move(self, text):
+            moves_at.append(len(spoilt.moves))
+            return False
+
+    with pytest.raises(InputError, match="may not move"):
+        run_of(tmp_path, spoilt, cell, desk=Placing()).measure()
+    assert moves_at == [0, 0]
+    assert not spoilt.moves
+
+
+def test_a_plate_that_is_not_there_is_noticed_at_the_first_stops(tmp_path):
+    cell, machine = write_cell(tmp_path, simulation=SIMULATION.replace("t: 5.0e-6", "t: 9.0e-4"),
+                               camera=True)
+    spoilt = Spoilt(machine)
+    with pytest.raises(NoDataError, match="nothing is seen at the first 5 stops"):
+        run_of(tmp_path, spoilt, cell).measure()
+    assert len(spoilt.moves) < 12
+
+
+def test_a_mark_that_is_never_seen_is_named(tmp_path):
+    cell, machine = write_cell(tmp_path)
+
+    class Dirty(Spoilt):
+        def offsets(self):
+            return [seen for seen in super().offsets() if seen.mark != (1, -1)]
+
+    with pytest.raises(NoDataError, match=r"mark \(1, -1\) are not read after 3 more visits"):
+        run_of(tmp_path, Dirty(machine), cell).measure()
+
+
+def test_marks_that_were_missed_are_visited_again(tmp_path):
+    cell, machine = write_cell(tmp_path)
+
+    class Forgetful(Spoilt):
+        n_seen = 0
+
+        def offsets(self):
+            self.n_seen += 1
+            return [] if self.n_seen % 5 == 0 else super().offsets()
+
+    run_of(tmp_path, Forgetful(machine), cell).measure()
+    counts = [view.count.min() for view in collect_bag(
+        tmp_path / "bag", CollectorSettings()).measurements.views]
+    assert min(counts) >= 2
+
+
+def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(MachineError):
+        run_of(tmp_path, Spoilt(machine, "lost connection", after=18), cell).measure()
+
+    class Rehomed(Spoilt):
+        """After the power cut its zero is 3 um beside the old one."""
+
+        def position(self):
+            x, *others = super().position()
+            return (x + 3e-6, *others)
+
+        def move_to(self, position):
+            super().move_to((position[0] - 3e-6, *position[1:]))
+
+    desk = Agreeing()
+    run_of(tmp_path, Rehomed(machine), cell, Jumping(Jumping().ns + 10**12), desk).measure(
+        resume=True)
+    assert any("its marks lie" in line and "measured anew" in line for line in desk.lines)
+    readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
+    assert readings.views[0].rejected.get("superseded_by_redo", 0) > 0 or (
+        readings.rejected.get("superseded_by_redo", 0) > 0)
+    assert calibrate(readings).verdict.qualified
+
+
+def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(MachineError):
+        run_of(tmp_path, Spoilt(machine, "lost connection", after=12), cell).measure()
+    with pytest.raises(InputError, match="exists already; continue it with --resume"):
+        run_of(tmp_path, machine, cell).measure()
+    (tmp_path / "plan.yaml").write_text(PLAN.replace("repeats: 2", "repeats: 3"))
+    with pytest.raises(InputError, match="of another plan"):
+        run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12)).measure(resume=True)
+
+
+def test_a_clock_that_was_set_back_does_not_continue(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(MachineError):
+        run_of(tmp_path, Spoilt(machine, "lost connection", after=12), cell).measure()
+    with pytest.raises(InputError, match="clock is behind the last message"):
+        run_of(tmp_path, machine, cell, Jumping()).measure(resume=True)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells for tests: a clock without waiting, a machine with faults, a person who agrees."""
+
+import numpy as np
+
+from selfcal_ros.machine import Image, MachineError
+from selfcal_ros.machine.cell import open_machine, read_cell
+
+START_NS = 1_700_000_000_000_000_000
+PLAN = """
+plan_id: machine
+artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}
+check_stops: {marks: 3, offset: 20e-6}
+views:
+  - {name: identity, repeats: 2}
+  - {name: rot90, rotation_deg: 90, repeats: 2}
+  - {name: shift, translation_pitch: [1, 0], repeats: 2}
+"""
+SIMULATION = """
+plan: plan.yaml
+seed: 3
+truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
+noise: {sigma_xy: 5.0e-9, sigma_theta: 1.0e-6}
+"""
+CAMERA = "camera: {width: 150, height: 140, pixel_size: 2.0e-6, mark_size: 50.0e-6, turn: 3.0}\n"
+DETECTOR = "detector: {pixel_size: 2.0e-6, mark_size: 50.0e-6, turn: 3.0}\n"
+CELL = """
+machine: simulated
+simulated: {simulation: sim.yaml}
+limits: {x: [-0.01, 0.01], y: [-0.01, 0.01], theta: [-7, 7]}
+placing: robot
+settle: {patience: 1.0}
+"""
+
+
+class Jumping:
+    """A clock on which a wait takes no time; every look at it takes a microsecond."""
+
+    def __init__(self, start_ns: int = START_NS) -> None:
+        self.ns = start_ns
+
+    def now_ns(self) -> int:
+        self.ns += 1000
+        return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        self.ns += round(seconds * 1e9)
+
+
+class Agreeing:
+    """A person who places the plate at once and agrees to everything."""
+
+    def __init__(self) -> None:
+        self.lines, self.placed, self.shown = [], [], []
+
+    def place(self, command) -> None:
+        self.placed.append(command.placed().name)
+
+    def may_move(self, text: str) -> bool:
+        return True
+
+    def lies_still(self, view: str) -> bool:
+        return True
+
+    def show(self, progress) -> None:
+        self.shown.append(progress.coverage)
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+
+
+class Spoilt:
+    """A machine with a fault, from the `after`-th call of a method on.
+
+    `fault` is a name in `FAULTS`: what a method of the sound machine returned is changed.
+    """
+
+    def __init__(self, machine, fault: str = "", after: int = 0) -> None:
+        self.machine, self.fault, self.after = machine, fault, after
+        self.axes = machine.axes
+        self.moves, self.stops, self.images = [], 0, 0
+        self._frozen, self._kept = None, None
+        self._offset = np.zeros(len(self.axes))
+
+    @property
+    def is_on(self) -> bool:
+        return len(self.moves) >= self.after
+
+    def place(self, placing) -> None:
+        self.machine.place(placing)
+
+    def position(self):
+        at = np.array(self.machine.position())
+        if self.is_on and self.fault == "frozen position":
+            self._frozen = at if self._frozen is None else self._frozen
+            at = self._frozen
+        if self.is_on and self.fault == "never at rest":
+            self._offset[0] = -self._offset[0] if self._offset[0] else 3e-6
+            at = at + self._offset
+        if self.is_on and self.fault == "position in mm":
+            at = at * 1e3
+        if self.is_on and self.fault == "indicates exchanged axes":
+            at[:2] = at[1::-1]
+        if self.is_on and self.fault == "indicates reversed x":
+            at[0] = -at[0]
+        if self.is_on and self.fault == "no number":
+            at[1] = np.nan
+        return tuple(at.tolist())
+
+    def move_to(self, position) -> None:
+        self.moves.append(position)
+        if self.is_on and self.fault == "lost connection":
+            raise MachineError("the connection was lost", "port /dev/ttyUSB0", "plug it in")
+        if self.is_on and self.fault == "limit switch":
+            position = (min(position[0], 0.0), *position[1:])
+        if self.is_on and self.fault == "stands still":
+            return
+        self.machine.move_to(position)
+
+    def image(self):
+        shown = self.machine.image()
+        self.images += 1
+        if shown is None or not self.is_on:
+            self._kept = shown
+            return shown
+        before, self._kept = self._kept, shown
+        pixels = shown.pixels
+        if self.fault == "last image again":
+            self._kept = before
+            return before
+        if self.fault == "late by one frame":
+            return before
+        if self.fault == "black":
+            return Image(np.zeros_like(pixels))
+        if self.fault == "saturated":
+            return Image(np.full_like(pixels, 255))
+        if self.fault == "colour":
+            return Image(np.dstack([pixels] * 3))
+        if self.fault == "future stamp":
+            return Image(pixels, START_NS + 10**15)
+        if self.fault == "mirrored camera":
+            return Image(pixels[:, ::-1])
+        return shown
+
+    def offsets(self):
+        return self.machine.offsets()
+
+    def stop(self) -> None:
+        self.stops += 1
+
+    def close(self) -> None:
+        self.machine.close()
+
+
+def write_cell(folder, *, plan: str = PLAN, simulation: str = SIMULATION, cell: str = CELL,
+               camera: bool = False):
+    """Write plan.yaml, sim.yaml and cell.yaml; return the cell and its machine."""
+    (folder / "plan.yaml").write_text(plan)
+    (folder / "sim.yaml").write_text(simulation + (CAMERA if camera else ""))
+    (folder / "cell.yaml").write_text(cell + (DETECTOR if camera else ""))
+    found = read_cell(folder / "cell.yaml")
+    return found, open_machine(found)
