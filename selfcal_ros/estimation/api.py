@@ -19,6 +19,7 @@ from selfcal_ros.estimation.joint.camera import (
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
+from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
@@ -35,6 +36,7 @@ CAMERA_STEPS = 3
 """Number of fits for the camera's distortion, each with the readings corrected by the last."""
 
 
+@one_thread()
 def calibrate(measurements: Measurements, options: Options | None = None) -> CalibrationResult:
     """Estimate stage error, plate error and misalignments from readings.
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -308,7 +309,7 @@ def _likelihood(views: list[_Seen], noise: float, spread: float,
         start = end
     factor = np.linalg.cholesky(covariance)
     values = np.concatenate([seen.deviation for seen in views])
-    white = np.linalg.solve(factor, np.column_stack([free, values]))
+    white = solve_triangular(factor, np.column_stack([free, values]), lower=True)
     inner = white[:, :-1].conj().T @ white
     square = (np.linalg.norm(white[:, -1]) ** 2
               - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)

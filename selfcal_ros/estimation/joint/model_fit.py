@@ -41,16 +41,13 @@ MAX_STEPS = 100
 RESOLUTION = 1e-12
 """Change of a reading, against the largest misalignment, at which rotations stand still."""
 
-ROUGH_RESOLUTION = 1e-11
-"""The same once steps no longer shrink."""
-
 OF_NOISE = 1e-3
 """Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
 no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
 
-LATE, OF_NOISE_LATE = 20, 0.1
-"""Steps after which rounding is all that moves, and the change that is none from then on: plates
-laid millimetres beside their places make the offsets, and their rounding, as large."""
+OF_LARGEST = 1e-4
+"""Change, against the largest of all steps, from which one that grows again is rounding: an iteration
+that converges shrinks."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance, or of the weight of lines that have terms of
@@ -148,15 +145,17 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
-    before, peak = np.inf, float(np.abs(problem.grid.y).max())
+    before, most, peak = np.inf, 0.0, float(np.abs(problem.grid.y).max())
     for number in range(MAX_STEPS):
         change = state.step()
+        most = max(most, change)
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
         if change <= max(RESOLUTION * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
-        part = OF_NOISE if number < LATE else OF_NOISE_LATE
-        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
+        if stuck and state.within_noise(change):
+            return state.finished()
+        if change > before and change <= OF_LARGEST * most:
             return state.finished()
         if change > DIVERGES * peak:
             break
@@ -266,13 +265,13 @@ class _State:
         least = min(np.abs(self.found.parameters - parameters).max(), np.abs(self.y - y).max())
         return float(max(least, self.moving.change))
 
-    def within_noise(self, change: float, part: float) -> bool:
-        """Return whether a change of the misalignments is below a part of their uncertainty."""
+    def within_noise(self, change: float) -> bool:
+        """Return whether a change of the misalignments is far below their uncertainty."""
         spread = np.diag(self.found.inverse)
         spread = spread[spread > FIXED * spread.max(initial=0.0)]
         sigma = self.found.xy.sigma
         return bool(len(spread) and np.isfinite(sigma)
-                    and change <= part * sigma * np.sqrt(spread.min()))
+                    and change <= OF_NOISE * sigma * np.sqrt(spread.min()))
 
     def finished(self) -> ModelFit:
         equations, reduced = self.equations, self.reduced

@@ -334,9 +334,12 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
     sigma_m : float
         Noise of one grid reading, m.
     """
+    right = equations.unbiased_sums(found.total)
+    hidden = equations.untold(np.ones(equations.n, dtype=bool)) / equations.norm[:, None]
+    if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
+        right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
     prior = equations.prior(sigma_m)
-    return coefficients + equations.inverse(sigma_m) @ (
-        equations.unbiased_sums(found.total) - prior * coefficients)
+    return coefficients + equations.inverse(sigma_m) @ (right - prior * coefficients)
 
 
 def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:

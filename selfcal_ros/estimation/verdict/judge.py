@@ -175,7 +175,8 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     """
     declared = not options.assumed or any(
         term.name is TermName.MICROSCOPE and not term.free for term in options.terms)
-    if declared or sign_is_shown(measurements):
+    seen = all(view.visits is not None for view in measurements.views if len(view.m))
+    if declared or not seen or sign_is_shown(measurements):  # without offsets nothing can show it
         return []
     model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
     if model is None or model.equations is None:
