@@ -59,7 +59,7 @@ PLAN = {
     "image.nx": "marks along stage x, odd; the middle one is on the optical axis",
     "image.ny": "marks along stage y, odd",
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
-    "artifact.grid_size": "N, marks along x, 3 to 1001; or [along x, along y]",
+    "artifact.grid_size": "N, marks along x, 3 to 401; or [along x, along y]",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
     "artifact.angular_count": "K, angular lines, at least 3; 0 without lines",
     "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
@@ -114,7 +114,7 @@ RESULT = {
               "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
               "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "
               "default), details, text",
-    "input": "file and sha256 of the bag", "solver": "how the equations were solved",
+    "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
                         "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
                         "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "

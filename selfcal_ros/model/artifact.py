@@ -11,7 +11,7 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.marks import MarkList
 
-MAX_GRID_SIZE = 1001
+MAX_GRID_SIZE = 401
 MAX_ANGULAR_COUNT = 1_000_000
 MAX_HARMONICS = 180
 DEFAULT_NODES = 51
@@ -101,7 +101,11 @@ class Artifact:
                 object.__setattr__(self, name, value)
         sides = ("grid_size", self.grid_size), ("grid_size_y", self.shape[1])
         for name, size in () if self.marks else sides:
-            if not 3 <= size <= MAX_GRID_SIZE:
+            if size > MAX_GRID_SIZE:
+                raise InputError(f"artifact {name}", f"{size} rows of marks are more than "
+                                 f"{MAX_GRID_SIZE}", "use every other mark: half the rows, twice "
+                                 "the pitch")
+            if size < 3:
                 raise InputError(f"artifact {name}", f"{size} is not a number from 3 to "
                                  f"{MAX_GRID_SIZE}", "give the number of rows; marks in fewer rows "
                                  "as a list (artifact: {marks: FILE.csv})")

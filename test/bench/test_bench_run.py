@@ -50,8 +50,10 @@ def test_every_method_is_measured_and_exact(bench):
     methods = {row["method"] for row in rows}
     assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
             "pyceres"} <= methods
-    assert {row["benchmark"] for row in rows} == {"solve", "re-solve", "uncertainty",
-                                                "missing", "five views", "terms", "general"}
+    assert {row["benchmark"] for row in rows} == {
+        "solve", "without noise", "re-solve", "uncertainty", "missing", "five views", "terms",
+        "general"}
+    ours = next(row["max_error"] for row in rows if row["benchmark"] == "solve")
     for row in rows:
         assert row.keys() >= KEYS and row["n"] == 7
         assert row["method"] in out
@@ -59,8 +61,10 @@ def test_every_method_is_measured_and_exact(bench):
             assert row["note"] == "not installed" and row["method"] in ("gtsam", "pyceres")
         else:
             assert row["seconds"] > 0 and row["peak_mb"] > 10
-            noisy = row["benchmark"] in ("five views", "terms")
-            assert noisy or row["max_error"] < (1e-9 if row["method"] == "pyceres" else 1e-12)
+            if row["benchmark"] in ("without noise", "general"):
+                assert row["max_error"] < (1e-9 if row["method"] == "pyceres" else 1e-12)
+            elif row["benchmark"] == "solve":  # one minimum for all
+                assert row["max_error"] == pytest.approx(ours, rel=0.01)
 
 
 def test_unknown_methods_are_refused(bench, tmp_path):

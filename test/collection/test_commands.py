@@ -51,12 +51,12 @@ def test_limits_themselves_are_kept():
     assert collector.received["command"] == 3
 
 
-def test_a_plate_of_1001_marks_a_side_of_which_25_were_read():
+def test_a_plate_of_401_marks_a_side_of_which_25_were_read():
     cell = scene(count=0)
-    wide = [replace(c, artifact=Artifact(1001, 0.01)) if c.artifact else c for c in cell.commands]
+    wide = [replace(c, artifact=Artifact(401, 0.01)) if c.artifact else c for c in cell.commands]
     _, progress = collect([*wide, *cell.samples, *cell.detections])
-    assert (progress[0].grid_expected, progress[0].grid_done) == (1001**2, 25)
-    assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-500, -301)
+    assert (progress[0].grid_expected, progress[0].grid_done) == (401**2, 25)
+    assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-200, -1)
 
 
 @pytest.mark.parametrize("field", ["sigma", "score"])

@@ -72,10 +72,10 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((2, 0.01), "artifact grid_size: 2 is not a number from 3 to 1001; give the number of rows; "
+    ((2, 0.01), "artifact grid_size: 2 is not a number from 3 to 401; give the number of rows; "
      "marks in fewer rows as a list (artifact: {marks: FILE.csv})"),
     ((1, 0.01), "artifact grid_size: 1 is not"), ((-3, 0.01), "artifact grid_size: -3 is not"),
-    ((4003, 0.01), "artifact grid_size: 4003 is not"),
+    ((4003, 0.01), "artifact grid_size: 4003 rows of marks are more than 401; use every other"),
     ((11, 0.01, 0, 2), "artifact grid_size_y: 2 is not"),
     ((11, 0.0), "artifact grid_pitch: 0.0 m is not a length"),
     ((11, -0.01), "artifact grid_pitch: -0.01 m is not a length"),
@@ -153,7 +153,7 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (plan_with({"translation_mm": [1]}), "f: views[0]: translation_mm: not two numbers; give"),
     (plan_with({"translation_mm": [1, 0], "translation_pitch": [1, 0]}),
      "f: views[0]: translation_pitch and translation_mm are given; leave one of them out"),
-    (plan_with(map={"grid_size": 2}), "map grid_size: 2 is not a number from 3 to 1001; give"),
+    (plan_with(map={"grid_size": 2}), "map grid_size: 2 is not a number from 3 to 401; give"),
     (plan_with(map={"grid_size": 7, "grid_size_y": 2}), "map grid_size_y: 2 is not a number"),
     (plan_with(map={"grid_size": 7, "grid_pitch": -0.1}), "map grid_pitch: -0.1 m is not a length"),
     (plan_with(map={"grid_pitch": 0.01}), "f: map: the key 'grid_size' is missing; add it"),

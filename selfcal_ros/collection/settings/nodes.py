@@ -127,7 +127,7 @@ class SolverSettings(ManagedSettings):
         "published; the law is always linear", choices=("linear", "rigid"))
     uncertainty: str = declared(
         "auto", "uncertainty map of the joint solution: auto = up to 201 x 201 sites; always = up "
-        "to 1001 x 1001, in minutes", choices=tuple(UNCERTAINTY))
+        "to 401 x 401, in many seconds", choices=tuple(UNCERTAINTY))
     reference_kind: str = declared(
         "none", "object on which a known length was measured, which sets the scale",
         choices=("none", *map(str, ReferenceKind)))

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
@@ -309,7 +308,7 @@ def _likelihood(views: list[_Seen], noise: float, spread: float,
         start = end
     factor = np.linalg.cholesky(covariance)
     values = np.concatenate([seen.deviation for seen in views])
-    white = solve_triangular(factor, np.column_stack([free, values]), lower=True)
+    white = np.linalg.solve(factor, np.column_stack([free, values]))
     inner = white[:, :-1].conj().T @ white
     square = (np.linalg.norm(white[:, -1]) ** 2
               - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)

@@ -42,9 +42,7 @@ class JointFit:
     xy, theta : NoiseEstimate
         Noise of the grid and of the angular readings.
     inverse : float array (size, size)
-        Covariance of the misalignments for unit grid noise; empty if the sites were iterated.
-    solver : dict
-        Method of solution and residual reached.
+        Covariance of the misalignments for unit grid noise.
     ratio : float
         Weight of an angular reading (times the half width) relative to a grid reading; 0 = none.
     """
@@ -60,7 +58,6 @@ class JointFit:
     xy: NoiseEstimate
     theta: NoiseEstimate
     inverse: np.ndarray
-    solver: dict
     ratio: float = 0.0
 
     @property
@@ -87,12 +84,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
     theta = theta or angular_part(problem)
-    if problem.direct:
-        raw = _solve_direct(problem, y, theta)
-    else:
-        from selfcal_ros.estimation.joint.pcg import solve_iterated  # scipy.fft, for large fields
-
-        raw = solve_iterated(problem, y, theta)
+    raw = _solve_free(problem, y, theta)
     field, parameters = raw.field, raw.parameters
 
     parts = system.gauge.parts(field)
@@ -125,18 +117,17 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     parameters[system.phi_at] = phi * length
     a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-                    misclosure, xy, theta.noise, raw.inverse, raw.solver, raw.ratio)
+                    misclosure, xy, theta.noise, raw.inverse, raw.ratio)
 
 
-def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
+def _solve_free(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
     system, grid = problem.system, problem.system.grid
     n = 3 * grid.n_views
     free, d = grid.reduced(y)
     alone = system.grid_inverse @ d
     field = (free - grid.response @ alone).reshape(grid.views.shape)
     if not system.angular.n_views:
-        return FreeNetworkSolution(field, alone, None, system.grid_inverse,
-                                   {"method": "multifrontal"})
+        return FreeNetworkSolution(field, alone, None, system.grid_inverse)
     xy = grid_noise(problem, grid.plate(y, field, alone)[1])
     ratio = weight_ratio(problem, xy.sigma, theta.noise.sigma, y)
     right = np.zeros(system.size)
@@ -145,7 +136,7 @@ def _solve_direct(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNe
     inverse = system.inverse(ratio)
     parameters = inverse @ right
     field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
-    return FreeNetworkSolution(field, parameters, xy, inverse, {"method": "multifrontal"}, ratio)
+    return FreeNetworkSolution(field, parameters, xy, inverse, ratio)
 
 
 def angular_part(problem: Problem) -> AngularPart:

@@ -199,7 +199,7 @@ def image_noise(artifact: Artifact, views: Sequence[View],
         The yaw of the stage, if the model has it.
     """
     key = cells_seen(artifact, [views[index] for index in system.grid_index])
-    if not system.direct or key is None:
+    if key is None:
         return None
     size = None if yaw is None else (yaw.half_m, tuple(yaw.arms.tolist()))
     return _known.get(system, (key, size), lambda: _drawn(system, key, yaw))

@@ -46,8 +46,8 @@ OF_NOISE = 1e-3
 no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
 
 OF_LARGEST = 1e-4
-"""Change, against the largest of all steps, from which one that grows again is rounding: an iteration
-that converges shrinks."""
+"""Change, against the largest of all steps, from which one that grows again is rounding: while an
+iteration converges its steps shrink."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance, or of the weight of lines that have terms of
@@ -174,9 +174,8 @@ def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
     """Return the equations of columns about the estimate `found`."""
     if reduced is None:
         reduced = reduce_columns(problem.system.grid, columns.shapes)
-    inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
     known = list(filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals)))
-    projected = project(problem.system, reduced, inverse, columns.lines, ratio=found.ratio,
+    projected = project(problem.system, reduced, found.inverse, columns.lines, ratio=found.ratio,
                         half_width_m=problem.half_width_m)
     return TermEquations(problem.system, columns, projected, min(known, default=0.0),
                          found.ratio * problem.half_width_m**2)
@@ -241,7 +240,7 @@ class _State:
         if len(equations.columns.lines.at) and (
                 abs(self.found.ratio - self.ratio) > LINEAR * self.ratio):
             return True
-        return bool(len(now) and np.abs(now - then).max() > LINEAR * np.abs(then).max())
+        return bool(np.abs(now - then).max() > LINEAR * np.abs(then).max())
 
     def step(self) -> float:
         """Take one step; return the largest change of a misalignment or of a reading, m.
@@ -361,7 +360,7 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations, inver
     inverse, more : float arrays (p, p), (p,)
         `free_inverse` of the columns, and their free coefficients less those of the solution.
     """
-    if not (found.ratio > 0 and len(found.inverse)):
+    if not found.ratio > 0:
         return 0.0, 0.0
     system, angular = problem.system, problem.system.angular
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)

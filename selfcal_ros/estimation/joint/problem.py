@@ -178,8 +178,6 @@ class Problem:
         Unit of the system's positions, m.
     conditions : Conditions
         Angular datum.
-    direct : bool
-        Whether the sites are factorised rather than iterated.
     reference : ReferenceLength, optional
         What sets the scale.
     rigid : bool
@@ -210,7 +208,6 @@ class Problem:
     repeats_theta: tuple[float, float]
     half_width_m: float
     conditions: Conditions
-    direct: bool
     ground: TermInputs
     reference: ReferenceLength | None = None
     rigid: bool = True
@@ -264,7 +261,6 @@ class FreeNetworkSolution:
     parameters: np.ndarray
     xy: NoiseEstimate | None
     inverse: np.ndarray
-    solver: dict
     ratio: float = 0.0
 
 

@@ -10,7 +10,6 @@ from typing import Any, cast
 import numpy as np
 
 from selfcal_ros.errors import (
-    InputError,
     NoDataError,
     NotIdentifiableError,
     NotSettledError,
@@ -44,7 +43,7 @@ from selfcal_ros.estimation.joint.solved import (
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import MAX_DIRECT_SITES, NormalEquations
+from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
@@ -64,6 +63,9 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan, cells_seen
+
+UNASKED_SITES = 201 * 201
+"""Largest field of which the uncertainty is given unasked: a second, beyond it takes many."""
 
 
 def solve_joint(measurements: Measurements, options: Options) -> Solved:
@@ -131,18 +133,14 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
-    direct = system.direct or bool(options.uncertainty) or bool(options.terms)
-    if direct and system.grid.n_sites > MAX_DIRECT_SITES:
-        raise InputError("options", f"the uncertainty of {system.grid.n_sites} sites is beyond "
-                         f"the limit of {MAX_DIRECT_SITES}", "solve without the uncertainty")
     ground, rigid = ground_of(measurements, grid, half_width_m), options.finite_rotations
     terms = tuple(
         term for term in options.model_terms(
-            visits=all(v is not None for v in ground.visits), assumed=direct and rigid)
+            visits=all(v is not None for v in ground.visits), assumed=rigid)
         if ground.has(term.name))
     problem = Problem(
-        system, grid, angular, *repeats_of(measurements), half_width_m, conditions, direct,
-        ground, options.reference, rigid, terms, options.drift_degree,
+        system, grid, angular, *repeats_of(measurements), half_width_m, conditions, ground,
+        options.reference, rigid, terms, options.drift_degree,
         places=places_of(measurements, grid, ground, system.known_sites),
         at_places=options.at_places,
         images=image_noise(
@@ -156,20 +154,21 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
             seen: Observability) -> Solved:
     problem, found = model.problem, model.found
+    asked = options.uncertainty
+    wanted = problem.system.grid.n_sites <= UNASKED_SITES if asked is None else asked
     sigma = np.full(problem.system.known_sites.shape, found.xy.sigma)
-    if problem.direct and options.uncertainty is not False:
+    if wanted:
         sigma = sigma * noise_gain(problem, found)
     cover = None
-    wanted = options.uncertainty is not False
     # the datum of the axes is tested in any case
-    if problem.direct and (wanted or problem.conditions.datum is ThetaDatum.XY_AXES):
+    if wanted or problem.conditions.datum is ThetaDatum.XY_AXES:
         cover = MapsCovariance(problem.system, found.inverse, options.reference, terms=model.spread,
                                half_width_m=problem.half_width_m, sigma_m=found.xy.sigma)
     error_map, closure, kept = _error_map(measurements, model, cover, sigma, wanted=wanted)
     artifact_map = _artifact_map(model, cover if wanted else None, rms(sigma))
     findings = (*_unchecked(problem.system, measurements.sense),
                 *_magnification(artifact_map, options))
-    if not problem.direct and options.uncertainty is None:
+    if not wanted and asked is None:
         findings = (Finding("no_uncertainty"), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
@@ -181,7 +180,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         noise_of(found.xy, found.theta),
         measurements.all_rejected(), findings=findings, method="joint",
         sense=str(measurements.sense),
-        extra={"solver": found.solver, **kept, **_kept_images(measurements, model),
+        extra={**kept, **_kept_images(measurements, model),
                **kept_residuals(measurements, model)},
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(

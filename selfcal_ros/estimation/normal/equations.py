@@ -13,15 +13,6 @@ GAP = 1e-9
 """Relative size below which an eigenvalue of a misalignment matrix is zero; true zeros are
 near 1e-15 and the smallest others above 1e-4."""
 
-DIRECT_SITES = 201 * 201
-"""Largest number of sites for which the normal matrix is always factorised."""
-
-UNEVEN_SITES = 401 * 401
-"""The same for unequal weights, which slow the iteration down."""
-
-MAX_DIRECT_SITES = 1001 * 1001
-"""The same if an uncertainty is requested: 5.6 GB."""
-
 CORE = 41
 """Sites per side of the middle part of a large field."""
 
@@ -52,21 +43,13 @@ class NormalEquations:
         """Index of phi of each angular view among the misalignments."""
 
     @cached_property
-    def direct(self) -> bool:
-        """Whether the sites are factorised; if not, they are iterated."""
-        sites = self.grid.n_sites
-        weight = self.grid.weight
-        uneven = sites <= UNEVEN_SITES and weight.max() > 2 * weight[self.grid.read].min()
-        return bool(sites <= DIRECT_SITES or uneven)
-
-    @cached_property
     def _core(self) -> GridSystem:
         """Grid equations for the rank of the misalignments: the middle part of a large field.
 
         If the middle of the plate determines all misalignments up to the datum, so does the
         whole, since more readings can only add; if not, the whole has to be factorised.
         """
-        if self.grid.n_sites <= CORE**2 or (self.direct and not self.rank_only):
+        if self.grid.n_sites <= CORE**2 or not self.rank_only:
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)

@@ -177,11 +177,6 @@ class PlacedEquations(NormalEquations):
     grid: PlacedSystem
 
     @property
-    def direct(self) -> bool:
-        """Always: the nodes are factorised."""
-        return True
-
-    @property
     def _core(self) -> GridSystem:
         return self.grid
 

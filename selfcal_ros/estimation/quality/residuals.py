@@ -18,7 +18,6 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import fdtrc
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.fit import JointFit, fit
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import prepare
@@ -123,17 +122,8 @@ def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> 
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
-    """Fit the readings jointly and return their residuals with redundancies.
-
-    Raises
-    ------
-    InputError
-        If the field is so large that it is solved by iteration.
-    """
+    """Fit the readings jointly and return their residuals with redundancies."""
     problem, _ = prepare(measurements, options)
-    if not problem.direct:
-        raise InputError("--robust", f"{problem.system.grid.n_sites} sites are too many for the "
-                         "leverage of each reading", "solve without it")
     system = problem.system
     found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
                     residuals_theta=angular_residuals(system, problem.angular.y))

@@ -200,7 +200,7 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
            if term.free and term.name in OF_A_VIEW]
     if own and -1 in held.rows:
         return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
-    if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0 and model.problem.direct):
+    if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0):
         return ratio, NOTHING, None
     return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), None
 

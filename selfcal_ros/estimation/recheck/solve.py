@@ -207,7 +207,7 @@ def plate_readings(measurements: Measurements, options: Options,
     read = np.zeros(views.z_sites.size, dtype=bool)
     read[views.site_index[grid.weight > 0]] = True
     problem = Problem(
-        system, grid, angular, *repeats_of(measurements), length, nothing, True, ground,
+        system, grid, angular, *repeats_of(measurements), length, nothing, ground,
         rigid=options.finite_rotations, terms=terms, drift_degree=options.drift_degree,
         places=places_of(measurements, grid, ground, read.reshape(shape) if isinstance(
             views, LatticeViews) else np.ones(shape, dtype=bool)),

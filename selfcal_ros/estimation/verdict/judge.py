@@ -132,7 +132,7 @@ def _excluded(solved: Solved, result: CalibrationResult,
     model, emap = solved.model, result.error_map
     if model is None or not result.has_uncertainty or not np.isfinite(model.found.xy.sigma):
         return ()
-    if not (model.problem.direct and is_searched(emap.gx.size, options, failed=False)):
+    if not is_searched(emap.gx.size, options, failed=False):
         return ()
     return excluded_lines(model, options, rms(np.stack([emap.u_gx, emap.u_gy])))
 

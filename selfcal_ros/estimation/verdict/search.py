@@ -117,9 +117,8 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     place = None if measurements.artifact.map_grid else off_sites_cause(
         solved.model, solved.result.error_map, CAUSE_LEVEL)
     failed = failed or bool(sizes or place)
-    system, direct = solved.model.problem.system, solved.model.problem.direct
-    if direct and solved.xy.sigma > LEAST_NOISE_M and is_searched(
-            system.grid.n_sites, options, failed=failed):
+    sites = solved.model.problem.system.grid.n_sites
+    if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, _model(found.solved).sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests

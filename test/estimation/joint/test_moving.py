@@ -8,7 +8,6 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint import fit as fitting
-from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
@@ -122,25 +121,6 @@ def test_a_stage_at_the_sites_has_the_same_result_to_the_bit():
     for made in (one, two):
         made["provenance"].pop("created", None)
     assert one == two
-
-
-@pytest.mark.parametrize("missing", [0.0, 0.1])
-def test_iterated_fields_have_the_map_of_factorised_ones(monkeypatch, missing):
-    """Beyond 0.02 pitches u is that of the places, which a field that is iterated has not."""
-    _, readings = measured(plan_of("0,90,tx", Artifact(31, 0.01)), missing=missing, **FOLLOWS)
-    options = bare(uncertainty=False)
-    direct = calibrate(readings, options)
-    monkeypatch.setattr(equations, "DIRECT_SITES", 0)
-    monkeypatch.setattr(equations, "UNEVEN_SITES", 0)
-    systems.clear_cache()
-    iterated = calibrate(readings, options)
-    at_sites = calibrate(readings, replace(options, at_places=False))
-    systems.clear_cache()
-    assert iterated.extra["solver"]["method"] == "conjugate gradients"
-    np.testing.assert_allclose(iterated.error_map.gx, direct.error_map.gx, atol=1e-13)
-    assert np.nanmax(np.abs(at_sites.error_map.gx - direct.error_map.gx)) > 1e-8
-    assert iterated.verdict.qualified
-    assert [cause.name for cause in at_sites.verdict.causes] == ["off_sites"]
 
 
 @pytest.mark.parametrize("terms", ["", "approach"])

@@ -10,7 +10,6 @@ import pytest
 from selfcal_ros.estimation.comparison.covariance import system_behind
 from selfcal_ros.estimation.joint.problem import grid_dof
 from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.normal import equations, systems
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.rank import deficiency, unknowns_of
 from selfcal_ros.estimation.options import Options
@@ -131,22 +130,6 @@ def test_cells_in_one_line_and_views_without_images_turn_by_themselves():
     assert rotations_of(with_sub_views(plan.views)) == (0,) * 9 + (9,) * 9
     assert rotations_of(plan_of("0,90,tx", 5).views) == (0, 1, 2)
     assert planned_system(plan.artifact, row).grid.n_misalignments == 18
-
-
-def test_fields_that_are_iterated_have_one_rotation_too(monkeypatch):
-    measurements = with_lines(0.06)
-    options = replace(LINEAR, uncertainty=False)
-    direct = solve_joint(measurements, options).result
-    for name, value in (("DIRECT_SITES", 0), ("UNEVEN_SITES", 0), ("CORE", 3)):
-        monkeypatch.setattr(equations, name, value)
-    systems.clear_cache()
-    found = solve_joint(measurements, options).result
-    systems.clear_cache()
-    assert found.extra["solver"]["method"] == "conjugate gradients"
-    np.testing.assert_allclose(found.error_map.gx, direct.error_map.gx, atol=1e-12)
-    np.testing.assert_allclose(found.error_map.gy, direct.error_map.gy, atol=1e-12)
-    for one, other in zip(found.views, direct.views, strict=True):
-        assert one.phi == pytest.approx(other.phi, abs=1e-8)
 
 
 def test_a_saved_result_has_the_equations_of_its_readings():
