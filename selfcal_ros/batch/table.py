@@ -1,27 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of a batch in the order of time, the courses of its quantities, and its HTML page."""
+"""The table of a batch in the order of time, and the courses of its quantities."""
 
 import csv
 import io
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from html import escape
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.batch.folder import PER, SCHEMA, Record
-from selfcal_ros.errors import printable
-from selfcal_ros.reporting.figures.drawing import TICK, Drawing, Frame
-from selfcal_ros.reporting.figures.svg import inline_svg
-from selfcal_ros.reporting.report import page
 
 S_PER_DAY = 86400.0
 BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",
         "sha256", "result", "grade")
-STYLE = "td.text { text-align: left; min-width: 14rem; } td.bad { color: var(--bad); }\n"
 
 
 @dataclass(frozen=True)
@@ -166,92 +160,6 @@ def summary_lines(records: Sequence[Record], found: Sequence[PlanHistory],
         nothing = few if len(series.records) < FEWEST else "no quantity has a trend or a change"
         lines += [f"  {line}" for line in sentences or [nothing]]
     return lines
-
-
-def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Sequence[str]) -> str:
-    """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
-    good = bool(records) and all(record["exit_code"] == 0 for record in records)
-    head, *findings = lines
-    parts = [f'<p class="verdict{"" if good else " bad"}">{_text(head)}</p>',
-             f"<p>{'<br>'.join(map(_text, findings))}</p>" if findings else ""]
-    for series in found:
-        pictures = "\n".join(_figure(series, name, course)
-                             for name, course in series.courses.items())
-        if pictures:
-            parts.append(f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
-                         f'<div class="figures">{pictures}</div></section>')
-    parts.append(f"<section><h2>Bags</h2>{_table(records)}</section>")
-    return page(f"Calibrations from {len(records)} bags", "\n".join(parts), style=STYLE)
-
-
-def _text(value: object) -> str:
-    return escape(printable(str(value)))
-
-
-def _table(records: Sequence[Record]) -> str:
-    ordered = in_time(records)
-    names = dict.fromkeys(name for record in ordered for name in record.get("quantities", {}))
-    heads = [f"{text}{', ' * bool(unit)}{unit}" for text, unit in map(described, names)]
-    head = "".join(f"<th>{_text(cell)}</th>" for cell in ("bag", "first exposure", "verdict",
-                                                           *heads))
-    rows = []
-    for record in ordered:
-        quantities = record.get("quantities", {})
-        bad = ' class="text bad"' if record["exit_code"] else ' class="text"'
-        cells = [f"<td>{_text(record['bag'])}</td>",
-                 f"<td>{_text((record.get('first_exposure') or '')[:16].replace('T', ' '))}</td>",
-                 f"<td{bad}>{_text(record['message'])}</td>",
-                 *(f"<td>{_number(quantities.get(name))}</td>" for name in names)]
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    return ('<div class="scroll"><table><thead><tr>' + head + "</tr></thead><tbody>"
-            + "\n".join(rows) + "</tbody></table></div>")
-
-
-def _number(value: Any) -> str:
-    return "" if value is None else f"{value:.4g}"
-
-
-def _figure(series: PlanHistory, name: str, course: Course) -> str:
-    """Return a plot of values over time with the finding: a line, or a step at the change."""
-    text, unit = described(name)
-    caption = f"{text}{', ' * bool(unit)}{unit}"
-    if any(f"u_{name}" in record["quantities"] for record in series.records):
-        caption += ", bars ± 2 u"
-    days = series.days
-    values = np.array([record["quantities"].get(name) for record in series.records], dtype=float)
-    known = np.isfinite(values)
-    u = np.nan_to_num(np.array([record["quantities"].get(f"u_{name}") for record in
-                                series.records], dtype=float))
-    low, high = float((values - 2 * u)[known].min()), float((values + 2 * u)[known].max())
-    margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
-    drawing = Drawing(name, caption, 560, 150)
-    frame = Frame(drawing, (64, 14, 482, 108), (0.0, float(days[-1]) or 1.0),
-                  (low - margin, high + margin))
-    frame.border()
-    for value in sorted({low, high}):
-        drawing.label(58, frame.at(0.0, value)[1] + 4, f"{value:.4g}", size=TICK, anchor="end",
-                      colour="soft")
-    for number, (x, anchor) in enumerate(((64.0, "start"), (546.0, "end"))):
-        drawing.label(x, 142, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft")
-    for day, value, spread, record in zip(days, values, u, series.records, strict=True):
-        if np.isfinite(value):
-            if spread > 0:
-                drawing.line([frame.at(day, value + end) for end in (-2 * spread, 2 * spread)],
-                             stroke="soft")
-            drawing.discs([frame.at(day, value)], 3.0,
-                          fill="bad" if record["exit_code"] else "good")
-            drawing.spot(*frame.at(day, value), 6, f"{record['bag']}: {value:.6g} {unit}")
-    if course.finding is CourseKind.TREND:
-        slope = course.slope_per_day[0]
-        offset = float(np.nanmedian(values - slope * days))
-        drawing.line([frame.at(day, offset + slope * day) for day in (days[0], days[-1])],
-                     width=1.5)
-    elif course.finding is CourseKind.CHANGE:
-        middle = (days[course.last_before] + days[course.change]) / 2
-        drawing.line([frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3))
-        for ends, mean in (((days[0], middle), course.before), ((middle, days[-1]), course.after)):
-            drawing.line([frame.at(day, mean) for day in ends], width=1.5)
-    return (f"<figure>{inline_svg(drawing)}<figcaption>{_text(caption)}</figcaption></figure>")
 
 
 def described(name: str) -> tuple[str, str]:

@@ -19,10 +19,10 @@ from selfcal_ros.batch.folder import (
     opened,
 )
 from selfcal_ros.batch.jobs import run_job
+from selfcal_ros.batch.page import page_html
 from selfcal_ros.batch.table import (
     batch_json,
     csv_text,
-    page_html,
     series_of,
     summary_lines,
 )

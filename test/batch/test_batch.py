@@ -6,6 +6,7 @@ import html.parser
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,11 +19,11 @@ import pytest
 
 from selfcal_ros.batch import jobs
 from selfcal_ros.batch.folder import RECORDS, RESULTS, find_bags, opened
+from selfcal_ros.batch.page import _common_spans, _limits, page_html
 from selfcal_ros.batch.table import (
     batch_json,
     csv_text,
     described,
-    page_html,
     series_of,
     summary_lines,
 )
@@ -366,8 +367,35 @@ def test_quantities_with_an_uncertainty_have_bars_and_no_course_of_it():
     assert "nonorthogonality_arcsec" in series[0].courses
     assert "u_nonorthogonality_arcsec" not in series[0].courses
     text = page_html(found, series, [""])
-    assert "bars ± 2 u" in text and "bars" not in plain
+    assert "(u is not known)" in plain and "(u is not known)" not in text
     assert text.count('class="s-soft" d=') == plain.count('class="s-soft" d=') + 30
+    assert re.search(r"<td [^>]*>-?\d\.\d{3} ± 0\.020</td>", text)
+
+
+def test_plots_of_one_kind_share_a_scale_and_few_come_first():
+    found = records()
+    for day, record in enumerate(found):
+        record["quantities"] |= {"max_error_um": 0.7 + 0.01 * (day % 3), "rms_error_um": 0.2,
+                                 "rms_uncertainty_um": 0.01, "sigma_xy_um": 0.02}
+    series, = series_of(found)
+    spans = _common_spans(series)
+    assert spans["max_error_um"] == spans["rms_error_um"] != spans["sigma_xy_um"]
+    low, high = spans["max_error_um"]
+    assert low < 0.2 and high > 0.72 + 2 * 0.01
+    text = page_html(found, [series], [""])
+    first, more = text.split("<details>")
+    assert first.count("<figure>") == 2 and "2 further quantities" not in first
+    assert re.match(r"<summary>(\d) further quantities", more)[1] == str(more.count("<figure>"))
+    head = re.search(r"<thead><tr>(.*?)</tr>", text)[1]
+    assert re.findall(r"<th[^>]*>(.*?)</th>", head) == [
+        "bag", "first exposure", "verdict", "max error, µm", "nonorthogonality, arcsec"]
+
+
+def test_limits_are_three_robust_standard_deviations_about_the_median():
+    values = np.random.default_rng(5).normal(7.0, 0.1, 4001)
+    values[:40] = 1e6
+    low, high = _limits(values)
+    assert low == pytest.approx(6.7, abs=0.03) and high == pytest.approx(7.3, abs=0.03)
 
 
 def test_the_share_of_rejected_detections_is_of_all_that_were_read():
