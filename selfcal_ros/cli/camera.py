@@ -15,7 +15,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.units import M_PER_UM
-from selfcal_ros.vision.camera_pose import CameraPose, camera_pose
+from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.exposures import ImageDetector
 
 
@@ -56,29 +56,20 @@ def run(args: argparse.Namespace) -> int:
         print(f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
               "and are left out", file=sys.stderr)
     found = camera_pose(positions, images, Sense(args.sense))
-    _check_size(found, args)
+    require_size(found, mark_size_m=args.mark_size, mark_pixels=args.mark_pixels,
+                 where=args.positions or args.bag)
     values = {"pixel_size": found.pixel_size_m, "turn": math.degrees(found.turn_rad),
               "mirror": found.mirror, "mark": args.mark, "mark_size": args.mark_size,
               "polarity": args.polarity}
     write_yaml(args.output, {"mark_detector": {"ros__parameters": values}})
-    say(args, _text(found, args.output), {"file": args.output, **values, "u_pixel_size":
+    say(args, pose_text(found, args.output), {"file": args.output, **values, "u_pixel_size":
         found.u_pixel_size_m, "u_turn": math.degrees(found.u_turn_rad), "sheared": found.sheared,
         "u_sheared": found.u_sheared, "noise_px": found.noise_px})
     return 0
 
 
-def _check_size(found: "CameraPose", args: argparse.Namespace) -> None:
-    """Refuse a camera in which marks would have another size than stated."""
-    told = args.mark_size / args.mark_pixels
-    if abs(args.mark_size / found.pixel_size_m / args.mark_pixels - 1) > (
-            DetectorSettings().size_tolerance):
-        raise InputError(args.positions or args.bag, "by the moves of the stage a pixel has "
-                         f"{found.pixel_size_m / M_PER_UM:.3g} µm, by --mark-size over "
-                         f"--mark-pixels {told / M_PER_UM:.3g} µm",
-                         "correct the positions (m), --mark-size (m) or --mark-pixels")
-
-
-def _text(found: "CameraPose", output: str) -> str:
+def pose_text(found: "CameraPose", output: str) -> str:
+    """Return a camera in one line."""
     return (f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
             f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
             f"(u {math.degrees(found.u_turn_rad):.1g}°), "

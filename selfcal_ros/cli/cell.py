@@ -1,20 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal cell check``: a short run that shows an integrator the faults of a cell."""
+"""``selfcal cell``: try a machine without ROS; check the messages of a cell under ROS."""
 
 import argparse
 import json
 import os
 import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
 
+from selfcal_ros.cli.camera import pose_text
 from selfcal_ros.cli.processes import ended_by_signals, need_ros, process, ros_arguments
-from selfcal_ros.cli.terminal import add_json, put, tell
+from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.machine.cell import open_machine, read_cell, with_values
+from selfcal_ros.machine.trying import Trial, values_of
+from selfcal_ros.outputs import write_bytes
+from selfcal_ros.units import M_PER_UM
+from selfcal_ros.vision.drawing import circled
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    check = parser.add_subparsers(dest="cell_verb", metavar="check", required=True).add_parser(
+    verbs = parser.add_subparsers(dest="cell_verb", metavar="try|check", required=True)
+    attempt = verbs.add_parser(
+        "try", help="connect a machine, look, make small moves, complete its CELL.yaml",
+        description="Connects, writes a picture of what it sees, and after a yes moves by the size "
+        "of a mark around the present position: pixel size, turn, mirror, backlash and settling "
+        "time, written into CELL.yaml with their standard uncertainties. Needs no ROS.")
+    attempt.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector with mark "
+                         "and mark_size (docs/machines.md)")
+    attempt.add_argument("--mark-pixels", metavar="PX", type=float, default=0.0,
+                         help="size of a mark in the image, pixels; default: it is searched for")
+    attempt.add_argument("--yes", action="store_true", help="move without asking")
+    attempt.add_argument("-o", "--output", metavar="SEEN.png", help="picture of what is seen, "
+                         "with circles around the marks (default: beside CELL.yaml)")
+    add_json(attempt)
+    check = verbs.add_parser(
         "check", help="drive the cell through a short run and check its messages",
         description="Measures the 3 x 3 marks (4 along even sides) in the middle of the plate, "
         "placed straight, and reports joints, rates, clocks, commands, rest, ids, loss, check "
@@ -31,6 +54,61 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Try or check the cell."""
+    return _try(args) if args.cell_verb == "try" else _check(args)
+
+
+def _try(args: argparse.Namespace) -> int:
+    """Look, move after a yes, write what was found into CELL.yaml."""
+    cell = read_cell(args.cell)
+    output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
+    machine = open_machine(cell)
+    try:
+        trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
+        pixels, marks = trial.look()
+        print("position: " + ", ".join(f"{axis} {value:.6g}" for axis, value in zip(
+            trial.position.names, trial.position.positions, strict=True)), file=aside(args))
+        if pixels is not None:
+            write_bytes(output, circled(pixels, marks, trial.mark_pixels))
+            print(f"{output}: {len(marks)} marks of {trial.mark_pixels:.3g} pixels in an image of "
+                  f"{pixels.shape[1]} x {pixels.shape[0]}", file=aside(args))
+        if not args.yes and not _agrees(args, trial.step_m):
+            say(args, "nothing was moved or written", {"marks": len(marks)})
+            return int(ExitCode.DONE)
+        found = trial.move()
+    finally:
+        machine.close()
+    values, notes = values_of(found)
+    if values:
+        with_values(cell.path, "detector", values, notes)
+    if found.settling_s > cell.settle.time:
+        with_values(cell.path, "settle", {"time": float(f"{found.settling_s:.2g}")}, {})
+    with_values(cell.path, "found", {
+        f"backlash_{axis}": asdict(each) for axis, each in found.reversal.items()} | {
+        "settling_time": found.settling_s, "noise": found.noise_m}, {})
+    lines = [] if found.camera is None else [pose_text(found.camera, args.cell)]
+    lines += [f"backlash of {axis}: {each.value / M_PER_UM:.3g} µm (u {each.u / M_PER_UM:.1g} µm)"
+              for axis, each in found.reversal.items()]
+    lines.append(f"at rest {found.settling_s:.2g} s after a move; noise of a mark "
+                 f"{found.noise_m / M_PER_UM:.2g} µm")
+    lines += [f"note: {note}" for note in found.notes]
+    say(args, "\n".join(lines), {
+        "file": args.cell, "seen": output if pixels is not None else "", "marks": len(marks),
+        **values, "backlash": {axis: asdict(each) for axis, each in found.reversal.items()},
+        "settling_time": found.settling_s, "noise": found.noise_m, "notes": list(found.notes)})
+    return int(ExitCode.DONE)
+
+
+def _agrees(args: argparse.Namespace, step_m: float) -> bool:
+    """Ask whether the stage may move."""
+    if not sys.stdin.isatty():
+        raise InputError("stdin", "there is nobody to ask: it is not a terminal", "give --yes")
+    print(f"the stage moves by up to {step_m / M_PER_UM:.4g} um in x and y: may it? [y/N] ", end="",
+          file=aside(args), flush=True)
+    return input().strip().lower() in ("y", "yes")
+
+
+def _check(args: argparse.Namespace) -> int:
     """Check the cell, print the results; exit code 5 if a check fails."""
     need_ros("")
     read_plan(args.plan)

@@ -39,7 +39,7 @@ VERBS = {
     "monitor": Verb(MEASURE, "show a running cell on one screen, and operate it by keys"),
     "call": Verb(MEASURE, "ask a running cell to start, confirm, redo, skip or abort"),
     "measure": Verb(MEASURE, "measure a plan with a machine, without ROS, and solve"),
-    "cell": Verb(MEASURE, "check a machine cell before its first calibration"),
+    "cell": Verb(MEASURE, "try a machine, or check a cell before its first calibration"),
     "camera": Verb(MEASURE, "find the pixel size, rotation and mirroring of a camera"),
     "detect": Verb(MEASURE, "find the marks in the images of a bag"),
     "solve": Verb(MEASURE, "calibrate from a bag: MCAP file or rosbag2 folder"),
@@ -69,6 +69,7 @@ EXAMPLES = {
     "up": "selfcal up --plan config/plans/hu.yaml --simulate",
     "monitor": "selfcal monitor --namespace cell_1",
     "call": "selfcal call start",
+    "cell try": "selfcal cell try CELL.yaml",
     "cell check": "selfcal cell check --plan config/plans/hu.yaml",
     "measure": "selfcal measure config/plans/hu_repeated.yaml config/cells/simulated.yaml "
                "-o measured --yes",

@@ -26,6 +26,8 @@ SHIPPED = {
     "simulated": "selfcal_ros.machine.simulated:SimulatedMachine",
 }
 """Machines of this package; further ones are entry points of the group ``selfcal.machines``."""
+DEFAULT_STEP_M = 1e-4
+"""First move where the size of the marks is not known."""
 PLACERS = ("person", "robot")
 NOT_OF_A_CELL = ("autostart", "hardware_id", "transport", "max_waiting", "frame_id")
 """Parameters of the node mark_detector that a cell does not have."""
@@ -97,6 +99,11 @@ class Cell:
     detector: DetectorSettings | None = None
     placing: str = "person"
     place_command: str = ""
+
+    @property
+    def first_step_m(self) -> float:
+        """Length of the first move, m: the size of a mark, so that it stays in sight."""
+        return (self.detector.mark_size if self.detector else 0.0) or DEFAULT_STEP_M
 
     @property
     def name(self) -> str:

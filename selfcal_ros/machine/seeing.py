@@ -65,7 +65,7 @@ class Eye:
             If the cell has no detector for it.
         """
         if isinstance(shown, Image):
-            picture = self._picture(shown, position)
+            picture = self.trusted(shown, position)
             return self._of_images().take_picture(picture, shown.stamp_ns or stamp_ns)
         return [_detection(offset, stamp_ns) for offset in shown]
 
@@ -78,8 +78,8 @@ class Eye:
             self._detector = ImageDetector(self._settings, f"{self._where}: detector")
         return self._detector
 
-    def _picture(self, image: Image, position: tuple[float, ...]) -> Picture:
-        """Return the grey values of an image that can be trusted."""
+    def trusted(self, image: Image, position: tuple[float, ...]) -> Picture:
+        """Return the grey values of an image, after checks; raises MachineError."""
         pixels = np.asarray(image.pixels)
         if pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
             raise MachineError(f"an image is {pixels.dtype} {pixels.shape}", "machine.image",

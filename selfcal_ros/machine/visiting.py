@@ -35,8 +35,6 @@ EMPTY_STOPS = 5
 """First stops of a view at which nothing is seen, after which it is given up."""
 FOLLOWS = 0.25
 """Largest deviation, over the step, of a position or a mark from the step of the stage."""
-DEFAULT_STEP_M = 1e-4
-"""First move where the size of the marks is not known."""
 UNITS = {1e3: "mm for m", 1e6: "um for m", 1e-3: "m for mm", 1e-6: "m for um",
          25.4: "inches", 1 / 25.4: "inches"}
 """Factor of a position that is given in another unit -> the units."""
@@ -322,21 +320,22 @@ class Visitor:
         yield from _track(at, before)
         yield from _around(before, found, after)
 
-    def first_move(self, *, marks: bool) -> None:
+    def first_move(self, *, marks: bool, step_m: float = 0.0) -> None:
         """Make a small move along each axis and back; check that position and marks follow.
 
         Parameters
         ----------
         marks : bool
             Whether a mark is in sight whose offset has to follow.
+        step_m : float
+            Length of the move, m; 0 = `Cell.first_step_m`.
 
         Raises
         ------
         MachineError
             If they do not, with the likely reason.
         """
-        size = self.cell.detector.mark_size if self.cell.detector else 0.0
-        step = size or DEFAULT_STEP_M
+        step = step_m or self.cell.first_step_m
         start = self.sample()
         self._last = start
         home = dict(zip(self.axes, start.positions, strict=True))
@@ -351,6 +350,7 @@ class Visitor:
 
     def _stepped(self, axis: str, home: Position, step: float) -> float:
         """Move one axis; return where it is; raise if the position does not follow."""
+        self.cell.require_limits(axis, self.cell.to_machine(axis, home[axis] + step), "a move")
         try:
             return dict(zip(self.axes, self.go({axis: home[axis] + step}).positions,
                             strict=True))[axis]

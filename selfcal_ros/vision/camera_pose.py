@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.units import M_PER_UM
 
 NOT_SIMILAR = 0.02
 """Relative difference of the two axes, or shear, above which a camera is refused."""
@@ -159,3 +161,15 @@ def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: 
                          "and that the encoder axes are those of the camera's stage")
     return CameraPose(float(found[0]), float(u[0]), float(found[1]), float(u[1]), mirror, sheared,
                       float(u[2:].max()), noise)
+
+
+def require_size(found: CameraPose, *, mark_size_m: float, mark_pixels: float,
+                 where: str) -> None:
+    """Raise InputError for a camera in which marks would have another size than stated."""
+    told = mark_size_m / mark_pixels
+    if abs(told / found.pixel_size_m - 1) > DetectorSettings().size_tolerance:
+        raise InputError(where, "by the moves of the stage a pixel has "
+                         f"{found.pixel_size_m / M_PER_UM:.3g} µm, by the size of the marks over "
+                         f"their pixels {told / M_PER_UM:.3g} µm",
+                         "correct the unit of the positions (m), the size of the marks (m) or "
+                         "their pixels")

@@ -146,7 +146,8 @@ def test_positions_or_marks_in_other_units_are_refused(tmp_path, capsys, factor,
     assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"),
                 *options) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert f"a pixel has {by_moves} µm, by --mark-size over --mark-pixels {by_mark} µm; " in line
+    assert (f"a pixel has {by_moves} µm, by the size of the marks over their pixels "
+            f"{by_mark} µm; ") in line
     assert not (tmp_path / "b.yaml").exists()
 
 

@@ -285,7 +285,8 @@ RUNS = {
     "step-diagonal": "step-diagonal DATA --method new -o d.json"}
 NEEDS_NODES = {"replay", "up", "monitor", "call", "cell check"}
 ELSEWHERE = {"detect": "test_detect.py", "recheck": "test_recheck.py",
-             "camera init": "test_camera.py", "measure": "test_measure.py"}
+             "camera init": "test_camera.py", "measure": "test_measure.py",
+             "cell try": "test_cell_try.py"}
 """Verbs whose bags are made by other tests."""
 
 

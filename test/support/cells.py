@@ -129,7 +129,7 @@ class Spoilt:
             self._kept = before
             return before
         if self.fault == "late by one frame":
-            return before
+            return before or shown
         if self.fault == "black":
             return Image(np.zeros_like(pixels))
         if self.fault == "saturated":
