@@ -17,6 +17,7 @@ from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import session_digest, view_digest
 from selfcal_ros.model.result import result_to_dict
@@ -239,7 +240,9 @@ def test_the_stamp_is_that_of_the_newest_reading(desk):
 @pytest.mark.parametrize("planned, level, line", [
     (4, Level.OK, "1 of 4 views measured, not yet enough to identify the stage."),
     (1, Level.WARN, None)])
-def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(desk, planned, level, line):
+def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(
+        tmp_path, planned, level, line):
+    desk = Desk(result_folder=str(tmp_path))
     desk.session.take_command(command(planned))
     desk.take(views_of()[:1])
     told = desk.session.diagnosis()
@@ -247,6 +250,13 @@ def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(desk, pla
     assert (told.message == line) is (line is not None)
     with pytest.raises(NotIdentifiableError):
         desk.session.save("x.json")
+    saved = read_json(tmp_path / "x.json")
+    assert (saved["plan_id"], saved["observability"]["identifiable"]) == (PLAN.plan_id, False)
+    (tmp_path / "good.json").write_text("a map")
+    with pytest.raises(NotIdentifiableError):
+        desk.session.save("good.json")
+    assert (tmp_path / "good.json").read_text() == "a map"
+    assert desk.session.diagnosis().values["saved"] == ""
 
 
 def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
