@@ -2,6 +2,7 @@
 """Make the recorded bags in bags/ and their manifest anew.
 
 hu_noise is recorded from the live topics of the simulated cell; the others are written directly.
+``make_bags.py NAME ...`` makes only these bags, ``make_bags.py --manifest`` none.
 """
 
 import shutil
@@ -17,10 +18,10 @@ from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
 from selfcal_ros.cli.replay import domain, process
 from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options
 from selfcal_ros.outputs import write_text
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.simulation.bag import write_simulation
@@ -35,6 +36,7 @@ WRITTEN = {"hu_exact": "hu_exact.yaml", "fig10_faults": "fig10_faults.yaml",
 DETECT = {"camera": {"pixel_size": 6.0e-6, "mark_size": 72.0e-6, "turn": 1.5}}
 """Parameters of mark_detector for bags of images."""
 RECORDED = "hu_noise"
+MANIFEST_ALONE = "--manifest"
 PARAMS = ROOT / "config" / "params" / "simulated_cell.yaml"
 PLAN = ROOT / "config" / "plans" / "hu_repeated.yaml"
 
@@ -63,13 +65,28 @@ def record(bag: Path) -> None:
 
 
 def of_images(name: str) -> dict:
-    """Return what the detector must find in a bag of images."""
+    """Return what the detector must find in a bag of images, and what this gives."""
     detector = ImageDetector(DetectorSettings.checked(DETECT[name], name))
     with TemporaryDirectory() as folder:
         ImageBag(BAGS / name).write_detected(Path(folder, name), detector.take, "stage")
-        measurements, _, lost, _ = collect_bag(Path(folder, name), CollectorSettings.checked(
-            {}, "defaults"))
-    return {**detector.counts.values(), "rejected": measurements.all_rejected(), "lost": lost}
+        return {**detector.counts.values(), **of_detections(Path(folder, name))}
+
+
+def of_detections(bag: Path) -> dict:
+    """Return what a bag must give with the defaults of collector and solver."""
+    measurements, _, lost, _ = collect_bag(bag, CollectorSettings.checked({}, "defaults"))
+    expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
+    settings = SolverSettings.checked({}, "defaults")
+    try:
+        result = calibrate(measurements, solver_options(settings, measurements))
+    except NotIdentifiableError as error:
+        return expected | {"identifiable": False, "deficiency": error.observability.deficiency}
+    numbers, emap = summary_numbers(result), result.error_map
+    return expected | {
+        "identifiable": True, "grade": str(result.verdict.grade),
+        "max_error_um": round(numbers["max_error_um"], 4),
+        "nonorthogonality_urad": round(emap.nonorthogonality * URAD_PER_RAD, 4),
+        "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
 
 
 def entry(name: str, made: str) -> dict:
@@ -78,22 +95,12 @@ def entry(name: str, made: str) -> dict:
              "truth": f"{name}/truth.json"}
     if name in DETECT:
         return about | {"detect": DETECT[name], "expected": of_images(name)}
-    measurements, _, lost, _ = collect_bag(BAGS / name, CollectorSettings.checked(
-        {}, "defaults"))
-    expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
-    try:
-        result = calibrate(measurements, Options(assumed=()))  # what the readings alone give
-        numbers, emap = summary_numbers(result), result.error_map
-        expected |= {"identifiable": True, "max_error_um": round(numbers["max_error_um"], 4),
-                     "nonorthogonality_urad": round(emap.nonorthogonality * URAD_PER_RAD, 4),
-                     "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
-    except NotIdentifiableError as error:
-        expected |= {"identifiable": False, "deficiency": error.observability.deficiency}
-    return about | {"expected": expected}
+    return about | {"expected": of_detections(BAGS / name)}
 
 
 def main() -> None:
     names = sys.argv[1:] or [RECORDED, *WRITTEN]
+    names = [name for name in names if name != MANIFEST_ALONE]
     for name in names:
         shutil.rmtree(BAGS / name, ignore_errors=True)
         if name == RECORDED:
