@@ -2,7 +2,10 @@
 """``selfcal gcode``: a program for a controller without tables, corrected."""
 
 import argparse
+import sys
 from dataclasses import replace
+
+import numpy as np
 
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
@@ -10,7 +13,8 @@ from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.cli.trace import command, deliver, outputs_of
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
-from selfcal_ros.controllers.grid import Wiring, wanted
+from selfcal_ros.controllers.gcode_codes import DIALECTS, PRINTERS
+from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.outputs import check_outputs
@@ -23,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("program", metavar="IN", help="G-code")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     add("-o", "--output", metavar="OUT", required=True, help="program to write; - = stdout")
+    add("--dialect", required=True, choices=DIALECTS, help="whose list of codes the program keeps")
     add("--tolerance", type=float, default=1.0, metavar="UM",
         help="largest distance of the corrected path from the programmed one, um (default 1)")
     add("--decimals", type=int, default=5, metavar="N",
@@ -37,15 +42,30 @@ def run(args: argparse.Namespace) -> int:
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
         raise InputError("--tolerance, --decimals", f"{args.tolerance} um, {args.decimals}",
                          "give 0.001 to 10000 um and 1 to 9 decimals")
-    unit = args.unit = args.unit or "mm"
+    if 10.0**-args.decimals * 1e3 > 2 * args.tolerance:
+        raise InputError("--decimals", f"{args.decimals} round by more than {args.tolerance:g} um",
+                         "give more, or a larger --tolerance")
+    if args.dialect in PRINTERS and args.unit == "in":
+        raise InputError("--unit", f"programs for {args.dialect} are in mm", "leave it out")
+    unit, args.unit = args.unit, args.unit or "mm"
     frame = replace(frame_of(args), unit="m")
     check_outputs([args.program, args.result], outputs_of(args))
     result, filled = ready(args)
     plate = result.artifact
     rewriter = Rewriter(
-        wanted(result.error_map, Wiring(frame)), tolerance_m=args.tolerance * M_PER_UM,
-        step_m=plate.grid_pitch_m / 32, unit=unit, decimals=args.decimals)
-    corrected = corrected_program(read_text(args.program), args.program, rewriter)
-    program = commented(corrected.text, origin_lines(result, command(args)))
-    return deliver(args, result, program, "program", filled=filled, moves=corrected.moves,
-                   pieces=corrected.pieces, note=f", {corrected.moves} moves as {corrected.pieces}")
+        wanted(result.error_map, Wiring(frame)), dialect=args.dialect,
+        tolerance_m=args.tolerance * M_PER_UM, step_m=plate.grid_pitch_m / 32, unit=unit,
+        decimals=args.decimals)
+    program = corrected_program(read_text(args.program), args.program, rewriter)
+    (x0, *_, x1), (y0, *_, y1) = nodes(result.error_map, frame)
+    lowest, highest = rewriter.reach_m
+    said = ["moves leave the field, beyond which the correction at its edge is used, without U"]
+    if np.all(lowest >= (x0 - ROUNDING_M, y0 - ROUNDING_M)) and np.all(
+            highest <= (x1 + ROUNDING_M, y1 + ROUNDING_M)):
+        said = []
+    for line in said:
+        print(f"selfcal gcode: {args.program}: {line}", file=sys.stderr)
+    comments = [*origin_lines(result, command(args)), *said]
+    return deliver(args, result, commented(program, comments), "program", filled=filled,
+                   moves=rewriter.moves, pieces=rewriter.pieces,
+                   note=f", {rewriter.moves} moves as {rewriter.pieces}")

@@ -2,355 +2,384 @@
 """Corrected G-code for controllers without tables: each point p is commanded as p + c(p).
 
 Lines and arcs of the XY plane are split so that the corrected path stays within a chord tolerance.
-All other words, comments and their order are kept. What would move the coordinates in a way that
-the program does not show is refused.
+What a code does is read from the list of its dialect. Every other code, word and character is
+refused, and so is a move that needs a position or a mode that the program has not stated.
 """
 
 import math
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
 from selfcal_ros.compensation.residual import Correction
+from selfcal_ros.controllers.gcode_codes import DIALECTS, PRINTERS, Code, remedy
 from selfcal_ros.errors import InputError
 from selfcal_ros.units import M_PER_INCH, M_PER_MM
 
-TOKEN = re.compile(r"(?P<comment>\([^()]*\)|;.*)|(?P<word>(?P<letter>[A-Za-z])\s*(?P<value>"
-                   r"[-+]?(?:\d+\.?\d*|\.\d+)))|(?P<space>\s+)|(?P<other>.)", re.ASCII)
-VERBATIM = re.compile(r"\s*(?:%|\$|$|M11[78]\b)|\s*(?P<macro>[A-Za-z_]{2})", re.ASCII | re.I)
-"""Lines without words: limits of a program, settings, messages, and macros."""
-AXES = "XYZABCUVWE"
-OTHERS = AXES[2:]
-CYCLES = {"38.2", "38.3", "38.4", "38.5", "73", *map(str, range(81, 90))}
-"""Motions of which only the end is corrected, as of G0."""
-HOMING = {"28", "28.2", "29", "30"}
-WORK = {"54", "55", "56", "57", "58", "59", "59.1", "59.2", "59.3"}
-REFUSED = {"10": "moves the coordinates", "52": "moves the coordinates", "92": "moves the "
-           "coordinates", "16": "uses polar coordinates", "51": "scales", "68": "turns",
-           "41": "offsets the path by the tool", "42": "offsets the path by the tool",
-           "93": "gives the feed as a time for each block", "53": "uses machine coordinates",
-           "5": "is a spline", "5.1": "is a spline", "33": "is a thread", "76": "is a thread",
-           "7": "uses diameters", "54.1": "moves the coordinates", "65": "calls a macro",
-           "66": "calls a macro", "12": "is a pocket", "13": "is a pocket",
-           "70": "means inches or something else", "71": "means mm or something else",
-           "7.1": "wraps the plane round a cylinder", "12.1": "uses polar coordinates",
-           "112": "uses polar coordinates"}
-KNOWN = {"0", "1", "2", "3", "4", "9", "17", "18", "19", "20", "21", "40", "43", "43.1", "49", "50",
-         "53", "61", "61.1", "64", "69", "80", "90", "90.1", "91", "91.1", "92", "94", "95", "96",
-         "97", "98", "99", *CYCLES, *HOMING, *WORK}
-"""Words beside which X and Y are known to be positions."""
-LINE = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
-AT_END = {"0", "1", "2", "30", "60"}
-"""M words that act once the motion has ended."""
+VALUE, BLANK = r"(?P<value>[-+]?(?:\d+\.?\d*|\.\d+))", r"|[ \t]+"
+TOKEN = re.compile(rf"\([^()]*\)|;.*|(?P<letter>[A-Za-z])[ \t]*{VALUE}{BLANK}", re.ASCII)
+PRINTER_TOKEN = re.compile(rf";.*|(?P<letter>[A-Z]){VALUE}?{BLANK}", re.ASCII)
+NAME = re.compile(r"\s*([A-Za-z_]{2,}\w*)")
+MESSAGE = re.compile(r"\s*M11[78](?:[ \t]|$)")
+FORBIDDEN = {"linuxcnc": r"[(;]\s*(?i:py|abort)", "grbl": r"[!?~]|[^\x00-\x7f]"}
+"""Comments that run Python or stop; characters that are obeyed at once, even in comments."""
+CONTROL = r"[\x00-\x08\x0a-\x1f\x7f]"
+ALWAYS = "NFST"
+"""Words that each line of a controller may have; a printer has one command in a line."""
+MOVES = ("rapid", "line", "arc", "hole")
+ACTS = (*MOVES, "cancel", "probe", "dwell", "home", "unknown", "tool length", "set E")
+MODES = ("distance", "unit", "plane", "path", "frame", "offset", "extruder")
+MUST_SAY = {"distance": ("G90 or G91", MOVES), "unit": ("G20 or G21", MOVES),
+            "plane": ("G17", ("arc", "hole")), "path": ("G61, G61.1 or G64", ("line", "arc"))}
+"""Modes without which a move is not understood; what to say; the moves."""
 OF_SAMPLES = 1 / 8
 """Part of the chord tolerance for the distance of the points on which the path is judged."""
 MAX_SAMPLES = 1_000_000
-LONGEST = 200
-"""Characters of a comment: LinuxCNC refuses lines of 256."""
+NO_TURN_RAD = 1e-4
+"""Sweep of an arc that a controller may take for a full turn."""
+MAX_WORDS, MAX_LINE, MAX_COMMENT = 79, 255, 200
+"""Characters of a line that grbl reads without blanks and comments, LinuxCNC with them."""
 
 
 class Word(NamedTuple):
-    """A word of a line, with its text; letter "" for comments and blanks."""
+    """A word of a line; letter "" for comments and blanks, value nan for a letter alone."""
 
     letter: str
-    code: str
+    value: float
     text: str
 
-
-class Corrected(NamedTuple):
-    """A corrected program, the number of its moves in XY, and of the moves that replace them."""
-
-    text: str
-    moves: int
-    pieces: int
+    @property
+    def name(self) -> str:
+        """The word as the lists write it."""
+        return f"{self.letter}{self.value:.10g}"
 
 
-def corrected_program(text: str, where: str, rewriter: "Rewriter") -> Corrected:
-    """Return a program with corrected moves.
-
-    Raises
-    ------
-    InputError
-        For a line that cannot be corrected.
-    """
-    out, newline = [], _newline(text)
-    for number, line in enumerate(LINE.findall(text), 1):
-        content = line.rstrip("\r\n")
-        made = rewriter.line(content, f"{where}:{number}")
-        out.append(newline.join(made) + line[len(content):])
-    return Corrected("".join(out), rewriter.moves, rewriter.pieces)
-
-
-def _newline(text: str) -> str:
-    """Return the first end of a line in a text."""
-    found = re.search(r"\r\n|\r|\n", text)
-    return found[0] if found else "\n"
+def corrected_program(text: str, where: str, rewriter: "Rewriter") -> str:
+    """Return a program with corrected moves; InputError names a line that cannot be corrected."""
+    out = []
+    for number, line in enumerate(re.findall(r"[^\n]*\n|[^\n]+", text), 1):
+        content = line.removesuffix("\n").removesuffix("\r")
+        end = line[len(content):]
+        out.append((end or "\n").join(rewriter.line(content, f"{where}:{number}")) + end)
+    return "".join(out)
 
 
 def commented(program: str, comments: Sequence[str]) -> str:
-    """Return a program with comments as its first lines, after a % and the program's number.
-
-    Between parentheses if the program has such comments, as not all controllers know both forms.
-    """
-    form = "({})" if "(" in re.sub(";.*", "", program) else "; {}"
-    newline = _newline(program)
-    text = "".join(form.format(re.sub(r"[^ -~]|[()]", "_", line[:LONGEST])) + newline
-                   for line in comments)
-    head = re.match(r"(?:\s*%[^\r\n]*[\r\n]+)?(?:[ \t]*O\d[^\r\n]*[\r\n]+)?", program,
-                    re.I | re.ASCII)
-    at = head.end() if head else 0
-    return program[:at] + text + program[at:]
+    """Return a program with comments as its first lines, after a %."""
+    newline = "\r\n" if "\r\n" in program else "\n"
+    begins = re.match(r"\s*%[^\n]*\n", program)
+    head = begins[0] if begins else ""
+    lines = ["; " + re.sub("[^ -~]|[!?~]", "_", text[:MAX_COMMENT]) + newline for text in comments]
+    return head + "".join(lines) + program[len(head):]
 
 
 class Rewriter:
-    """The modal state of a program, and its corrected lines.
+    """What a program has stated so far, and its corrected lines.
 
     Parameters
     ----------
     correct : Correction
         Correction of positions x, y; both in m.
+    dialect : str
+        A key of DIALECTS.
     tolerance_m : float
         Largest distance of the corrected path from the commanded one.
     step_m : float
         Largest distance of points at which the correction is looked up on a line.
-    unit : str
-        "mm" or "in", until G20 or G21.
+    unit : str, optional
+        "mm" or "in", if the program does not say it.
     decimals : int
         Of coordinates in mm; one more in inches.
     """
 
-    def __init__(self, correct: Correction, *, tolerance_m: float, step_m: float,
-                 unit: str = "mm", decimals: int = 5) -> None:
+    def __init__(self, correct: Correction, *, dialect: str, tolerance_m: float, step_m: float,
+                 unit: str | None = None, decimals: int = 5) -> None:
         self._correct, self._tolerance_m, self._step_m = correct, tolerance_m, step_m
-        self._decimals = decimals
-        self._inch, self._absolute, self._centre_absolute = unit == "in", True, False
-        self._motion, self._plane, self._work = "", "17", ""
-        self._e_absolute: bool | None = None  # as the other axes, until M82 or M83
-        self._at: dict[str, float] = {}  # x and y in m, others as programmed
-        self._sent: tuple[float, float] | None = None  # as commanded, in program units
+        self.dialect, self._codes, self._decimals = dialect, DIALECTS[dialect], decimals
+        self._printer = dialect in PRINTERS
+        unit = "mm" if self._printer else unit
+        self._said = {} if unit is None else {"unit": "G20" if unit == "in" else "G21"}
+        self._motion: Code | None = None
+        self._last_relative = False  # of G90, G91, M82 and M83
+        self._at: dict[str, float] = {}  # in the program's unit; an axis is absent if not known
+        self._sent = (math.nan, math.nan)  # X and Y as commanded
+        self._begun = self._ended = self._drawn = False
+        self._where = ""
         self.moves = self.pieces = 0
-
-    @property
-    def _unit_m(self) -> float:
-        return M_PER_INCH if self._inch else M_PER_MM
+        self.reach_m = np.array([[math.inf] * 2, [-math.inf] * 2])
+        """Least and largest x, y of the moves, m."""
 
     def line(self, text: str, where: str) -> list[str]:
-        """Return the lines that replace a line."""
-        verbatim = VERBATIM.match(text)
-        if verbatim:
-            if verbatim["macro"]:
-                self._forget()
-            return [text]
-        words = self._words(text, where)
-        values = {w.letter: float(w.code) for w in words if w.letter not in ("", "G", "M")}
-        codes = [w.code for w in words if w.letter == "G"]
-        self._refuse(codes, values, where)
+        """Return the lines that replace a line; InputError if one cannot be corrected."""
+        self._where = where
+        words = self._words(text)
+        values = self._values(words)
+        codes = [self._code(word) for word in words if word.letter in ("G", "M")]
+        act = self._act(codes, values)
         for code in codes:
             self._set(code)
-        self._set_extruder({w.code for w in words if w.letter == "M"})
-        if HOMING & set(codes):
-            if {"X", "Y"} & set(values) or not set(AXES) & set(values):
-                self._forget()
-            return [text]
-        if {"4", "92"} & set(codes):
-            self._at |= {a: values[a] for a in OTHERS if a in values and "92" in codes}
-            return [text]
-        arc = self._motion in ("2", "3")
-        if not set("XY" if not arc else AXES + "IJR") & set(values):
-            self._at |= self._ends(values)
-            return ["".join(_as_line(w).text for w in words)] if arc else [text]
-        return self._moved(words, values, where)
+        if "path" in {code.does for code in codes} and "Q" not in values:
+            words = [word._replace(text=f"{word.text} Q0") if word.name == "G64" else word
+                     for word in words]
+        if act and act.does in MOVES:
+            self._motion = act
+            if {*"XYZE"} & {*values} or act.does in ("arc", "hole"):
+                return self._moved(act, words, values, machine="G53" in {c.name for c in codes})
+        elif act:
+            self._do(act, values)
+        return ["".join(word.text for word in words)]
 
-    def _words(self, text: str, where: str) -> list[Word]:
-        found: list[Word] = []
-        for match in TOKEN.finditer(text):
-            if match["other"] and not (match["other"] == "/" and not "".join(
-                    w.text for w in found).strip()):
-                raise InputError(where, f"'{match['other']}' is not part of a word",
-                                 "parameters, expressions and sub-programs cannot be corrected: "
-                                 "post-process to plain words")
-            letter = (match["letter"] or "").upper()
-            code = match["value"] or ""
-            if letter in ("G", "M"):
-                code = f"{float(code):g}"
-            found.append(Word(letter, code, match[0]))
-        axes = [w.letter for w in found if w.letter in (*AXES, *"IJKR")]
-        if len(axes) != len(set(axes)):
-            raise InputError(where, "a coordinate is given twice", "keep one of them")
-        return found
+    def _refuse(self, what: str, mend: str) -> NoReturn:
+        raise InputError(self._where, what, mend)
 
-    def _refuse(self, codes: list[str], values: dict, where: str) -> None:
-        for code in codes:
-            why = REFUSED.get(code, "")
-            if code in ("53", "92") and not {"X", "Y"} & set(values):
-                why = ""
-            if code in WORK and self._work not in ("", code):
-                why = "changes the origin, whose place is not known"
-            if not why and code not in KNOWN and {"X", "Y"} & set(values):
-                why = "is not known, and may mean something else by X and Y"
-            if why:
-                raise InputError(where, f"G{code} {why}", "correct the program without it")
+    def _words(self, text: str) -> list[Word]:
+        """Return the words, comments and blanks of a line."""
+        wrong = re.search(f"{CONTROL}|{FORBIDDEN.get(self.dialect, CONTROL)}", text)
+        if wrong:
+            self._refuse(f"{wrong[0]!r} acts on {self.dialect} even in a comment", "remove it")
+        begun, self._begun = self._begun, self._begun or bool(text.strip())
+        if text.strip() == "%" and not self._printer:
+            self._ended |= begun
+            return [Word("", math.nan, text)]
+        if self._printer and MESSAGE.match(text):
+            return [Word("", math.nan, text)]
+        name = NAME.match(text)
+        if name:
+            self._refuse(f"{name[1]} may move anything",
+                         "write what it does in known codes, or run it before the program")
+        token, at, words = PRINTER_TOKEN if self._printer else TOKEN, 0, []
+        while at < len(text):
+            match = token.match(text, at)
+            if not match:
+                self._refuse(f"'{text[at]}' does not belong to a word of {self.dialect}",
+                             remedy(text[at]))
+            words.append(Word((match["letter"] or "").upper(), float(match["value"] or "nan"),
+                              match[0]))
+            at = match.end()
+        if self._ended and any(word.letter for word in words):
+            self._refuse("the line follows the end of the program", "remove it")
+        return words
 
-    def _set(self, code: str) -> None:
-        """Follow a modal G word."""
-        if code in ("20", "21") and (code == "20") != self._inch:
-            self._inch, self._sent = code == "20", None
-            self._at = {axis: self._at[axis] for axis in "XY" if axis in self._at}
-        elif code in ("90", "91"):
-            self._absolute = code == "90"
-        elif code in ("90.1", "91.1"):
-            self._centre_absolute = code == "90.1"
-        elif code in ("17", "18", "19"):
-            self._plane = code
-        elif code in WORK:
-            self._work = code
-        elif code in ("0", "1", "2", "3", "80", *CYCLES):
-            self._motion = code
+    def _values(self, words: Sequence[Word]) -> dict[str, float]:
+        """Return the values of the words that are not codes."""
+        letters = [word.letter for word in words if word.letter]
+        values = {word.letter: word.value for word in words if word.letter not in ("", "G", "M")}
+        for letter in values:
+            if letters.count(letter) > 1:
+                self._refuse(f"{letter} is given twice", "keep one of them")
+        if self._printer and letters[:1] not in ([], ["G"], ["M"]):
+            self._refuse("the line does not begin with a command", remedy(letters[0]))
+        if "N" in letters[1:] or values.get("F", 1.0) <= 0 or (values.get("Q", 0.0) and any(
+                word.name == "G64" for word in words)):
+            self._refuse("N does not begin the line, the feed is not positive, or G64 has a Q that "
+                         "merges lines", "correct it; G64 needs Q0")
+        return values
 
-    def _set_extruder(self, codes: set[str]) -> None:
-        if {"82", "83"} & codes:
-            self._e_absolute = "82" in codes
-        if "98" in codes:  # a sub-program
-            self._forget()
+    def _code(self, word: Word) -> Code:
+        code = self._codes.get(word.name)
+        if code is None or (self._printer and word.text != word.name):
+            self._refuse(f"{word.text} is not in the list of codes that are known of "
+                         f"{self.dialect}", remedy(word.name) if code is None else
+                         f"write {word.name}")
+        return code
 
-    def _forget(self) -> None:
-        self._at, self._sent = {}, None
+    def _act(self, codes: Sequence[Code], values: Mapping[str, float]) -> Code | None:
+        """Return the code by which a line acts, named or modal; refuse what does not belong."""
+        acts = [code for code in codes if code.does in ACTS]
+        kinds = [code.does for code in codes if code.does in MODES]
+        moved = {*"XYZE"} & {*values}
+        if len(acts) > 1 or len(kinds) > len({*kinds}) or (self._printer and len(codes) > 1):
+            self._refuse(f"{' and '.join(code.name for code in codes)} in one line",
+                         "write a line for each")
+        if moved and not acts and self._motion and not self._printer:
+            acts = [self._motion]
+        said = list(dict.fromkeys([*codes, *acts]))
+        if moved and not said:
+            self._refuse("the line does not name its command", "begin it with one")
+        words = "".join(code.words for code in said) + ALWAYS * (not self._printer)
+        for letter, value in values.items():
+            if words.count(letter) != 1:
+                self._refuse(f"{letter} is not a word of {' '.join(code.name for code in said)}",
+                             remedy(letter))
+            if math.isnan(value) and acts and acts[0].does not in ("home", "unknown"):
+                self._refuse(f"{letter} has no number", "give one")
+        return acts[0] if acts else None
 
-    def _is_absolute(self, axis: str) -> bool:
-        return self._absolute if axis != "E" or self._e_absolute is None else self._e_absolute
+    def _set(self, code: Code) -> None:
+        """Follow a mode."""
+        if code.does in ("unit", "frame", "offset") and (
+                self._said.get(code.does) != code.name or code.name == "G43"):
+            if self._drawn:
+                self._refuse(f"{code.name} follows a move in X or Y", remedy(code.name))
+            self._at.clear()
+        if code.does in MODES:
+            self._said[code.does] = code.name
+        if code.does in ("distance", "extruder"):
+            self._last_relative = code.name in ("G91", "M83")
+        if code.does == "unknown":
+            self._at.clear()
+        self._ended |= code.does == "end"
 
-    def _ends(self, values: dict[str, float]) -> dict[str, float]:
-        """Return where the other axes end; those that are not known are left out."""
-        out = {}
-        for axis in OTHERS:
-            absolute = self._is_absolute(axis)
-            if axis in values and (absolute or axis in self._at):
-                out[axis] = values[axis] + (0.0 if absolute else self._at[axis])
-        return out
+    def _do(self, act: Code, values: Mapping[str, float]) -> None:
+        """Follow an act that is not a move."""
+        if act.does in ("cancel", "probe"):
+            self._motion = None
+        if act.does == "home":
+            stays = self._said.get("distance") == "G91" and not any(values.get(a) for a in "XY")
+            if {"X", "Y"} & {*values} and not self._printer and not stays:
+                self._refuse(f"{act.name} passes a point that is not corrected",
+                             "write G91, and 0 for X and Y")
+            self._at.clear()
+        elif act.does in ("probe", "tool length"):
+            self._at.pop("Z", None)
+        elif act.does == "set E":
+            if "E" not in values:
+                self._refuse("G92 moves the frame", remedy("G92"))
+            self._at["E"] = values["E"]
 
-    def _moved(self, words: list[Word], values: dict[str, float], where: str) -> list[str]:
-        """Return the lines of a move in XY."""
-        start = tuple(self._at.get(axis, math.nan) for axis in "XY")
-        end = []
-        for axis, now in zip("XY", start, strict=True):
-            value = values.get(axis, 0.0) * self._unit_m
-            end.append(value if axis in values and self._absolute else now + value)
-        if self._motion in CYCLES and values.get("L", 1.0) != 1.0:
-            raise InputError(where, "a cycle is repeated", "write each hole in a line of its own")
-        if not all(map(math.isfinite, end)) or not (self._absolute or self._sent):
-            raise InputError(where, "the position before this line is not known",
-                             "begin with an absolute move of X and Y")
-        path = self._path((start[0], start[1]), (end[0], end[1]), values, where)
-        cx, cy = self._correct(path[:, 0], path[:, 1])
-        path = path + np.stack([cx, cy], axis=1)
-        kept = simplified(path, (1 - OF_SAMPLES) * self._tolerance_m)[1:]
-        share = kept / (len(path) - 1)
-        lines = self._lines(words, values, path[kept] / self._unit_m, share, where)
-        self._at |= {"X": end[0], "Y": end[1]} | self._ends(values)
-        if self._motion.startswith("38"):  # a probe may stop before its end
-            self._forget()
-        self.moves += 1
-        self.pieces += len(lines)
+    def _relative(self, axis: str) -> bool | None:
+        """Return whether an axis moves by increments; None if that depends on the firmware."""
+        relative = self._said["distance"] == "G91"
+        if axis == "E":
+            relative |= self._said.get("extruder") == "M83"
+            unsure = self.dialect == "marlin" and relative != self._last_relative
+            return None if unsure or "extruder" not in self._said else relative
+        return relative
+
+    def _moved(self, act: Code, words: list[Word], values: Mapping[str, float], *,
+               machine: bool) -> list[str]:
+        """Return the lines of a move, each with its command."""
+        for mode, (names, moves) in MUST_SAY.items():
+            known = mode in self._said or mode not in {c.does for c in self._codes.values()}
+            if act.does in moves and not known:
+                self._refuse(f"the program has not said {names}", "write it before the first move")
+        in_xy = bool({"X", "Y"} & {*values}) or act.does == "arc"
+        if (machine and (in_xy or act.does not in ("rapid", "line"))) or (
+                act.does in ("arc", "hole") and self._said.get("plane", "G17") != "G17") or (
+                self._relative("X") and (act.does, self.dialect) in
+                (("hole", "linuxcnc"), ("arc", "klipper"))):
+            self._refuse(f"{act.name} is not a move in the XY plane of the map", "write G17 for "
+                         "arcs, G90 for cycles, and Z alone with G53")
+        ends = {axis: math.nan if self._relative(axis) is None else
+                values[axis] + (self._at.get(axis, math.nan) if self._relative(axis) else 0.0)
+                for axis in "XYZE" if axis in values}
+        lines = self._corrected(act, words, ends) if in_xy else [_line(act, words, {})]
+        if machine or act.does == "hole":
+            ends["Z"] = math.nan
+        self._at = {axis: at for axis, at in (self._at | ends).items() if math.isfinite(at)}
+        if any(len(re.sub(r"\(.*?\)|;.*|\s", "", line)) > MAX_WORDS or len(line) > MAX_LINE
+               for line in lines):
+            self._refuse("the corrected line is too long", "shorten its words or comments")
         return lines
 
-    def _path(self, start: tuple[float, float], end: tuple[float, float],
-              values: dict[str, float], where: str) -> np.ndarray:
-        """Return points of the programmed path, (P, 2); of a rapid the end alone."""
-        if self._motion in ("2", "3"):
-            return self._arc(np.array(start), np.array(end), values, where)
-        if self._motion == "1" and math.isfinite(start[0]):
-            count = math.ceil(math.dist(start, end) / self._step_m)
-            return np.linspace(start, end, _few(count, where) + 1)
-        return np.array([end, end])
+    def _corrected(self, act: Code, words: list[Word], ends: Mapping[str, float]) -> list[str]:
+        """Return the lines of a move in XY."""
+        values = {word.letter: word.value for word in words}
+        unit_m = M_PER_INCH if self._said["unit"] == "G20" else M_PER_MM
+        path, off_m = self._path(act, values, ends, unit_m)
+        self.reach_m = np.array([np.minimum(self.reach_m[0], path.min(axis=0)),
+                                 np.maximum(self.reach_m[1], path.max(axis=0))])
+        path = path + np.stack(self._correct(path[:, 0], path[:, 1]), axis=1)
+        kept = simplified(path, (1 - OF_SAMPLES) * self._tolerance_m - off_m)[1:]
+        stops = [word for word in words if word.letter == "M"
+                 and self._codes[word.name].does in ("stop", "end")]
+        others = [word for word in words if word not in stops]
+        lines: list[str] = []
+        before, code = 0.0, self._codes["G1"] if act.does == "arc" else act
+        for at in kept.tolist():
+            share, texts = at / (len(path) - 1), self._coordinates((path[at] / unit_m).tolist())
+            for axis in "ZE" if len(kept) > 1 else "":
+                if axis in ends:
+                    texts[axis] = self._shared(axis, values[axis], (before, share))
+            lines.append(_line(code, [*others, *stops * (share == 1)], texts))
+            others, before = [], share
+        self._drawn, self.moves, self.pieces = True, self.moves + 1, self.pieces + len(lines)
+        return lines
 
-    def _arc(self, start: np.ndarray, end: np.ndarray, values: dict[str, float],
-             where: str) -> np.ndarray:
-        if self._plane != "17" or "P" in values or not np.isfinite(start).all():
-            raise InputError(where, "the arc is not one turn in the XY plane from a known point",
-                             "correct the program without it")
-        unit, sense = self._unit_m, -1 if self._motion == "2" else 1
-        given = set("IJR") & set(values)
-        if not given or (self._centre_absolute and given in ({"I"}, {"J"})):
-            raise InputError(where, "G90.1 needs I and J" if given else "the arc has no I, J or R",
-                             "give its centre, or begin a line with G1")
-        if "R" in values:
-            chord, radius = end - start, values["R"] * unit
-            half = float(np.hypot(*chord)) / 2
-            if not 0 < half <= abs(radius) * (1 + 1e-6):
-                raise InputError(where, "no arc of this radius joins its ends", "check R")
+    def _path(self, act: Code, values: Mapping[str, float], ends: Mapping[str, float],
+              unit_m: float) -> tuple[np.ndarray, float]:
+        """Return points of the way, m, and how far a controller may be off them.
+
+        Of a rapid, of a cycle, and of a printer's travel from an unknown place, the end alone.
+        """
+        start = [self._at.get(axis, math.nan) for axis in "XY"]
+        end = [ends.get(axis, now) for axis, now in zip("XY", start, strict=True)]
+        free = act.does in ("rapid", "hole") or (self._printer and act.does == "line"
+                                                 and "E" not in ends)
+        if not all(map(math.isfinite, end if free else [*start, *end])):
+            self._refuse("the position before this line is not known", "write an absolute move of "
+                         "X and Y before it" + " with G0" * (not self._printer))
+        ends_m = np.array([start, end]) * unit_m
+        if act.does == "arc":
+            if self.dialect == "grbl" and not {"X", "Y"} & {*ends}:
+                self._refuse("grbl needs X or Y for an arc", "give its end")
+            return self._arc(act, ends_m, {a: values[a] * unit_m for a in "IJR" if a in values})
+        if act.does == "line" and math.isfinite(start[0]):
+            count = self._few(math.dist(*ends_m) / self._step_m)
+            return np.linspace(ends_m[0], ends_m[1], count + 1), 0.0
+        return ends_m[[1, 1]], 0.0
+
+    def _arc(self, act: Code, ends_m: np.ndarray,
+             values_m: Mapping[str, float]) -> tuple[np.ndarray, float]:
+        """Return points of an arc, m, and how far a controller may be off them."""
+        (start, end), sense = ends_m, -1 if act.name == "G2" else 1
+        chord = end - start
+        half = float(np.hypot(*chord)) / 2
+        if values_m.keys() not in ({"R"}, {"I"}, {"J"}, {"I", "J"}):
+            self._refuse("an arc needs R, or I and J", "give its centre, or begin the line with G1")
+        if "R" in values_m:
+            radius = values_m["R"]
+            if not 0 < half <= abs(radius) * (1 + 1e-9):
+                self._refuse("no arc of this radius joins its ends", "check R")
             height = math.sqrt(max(radius**2 - half**2, 0.0)) * math.copysign(1, radius) * sense
             middle = (start + end) / 2 + height * np.array([-chord[1], chord[0]]) / (2 * half)
         else:
-            middle = np.array([values.get("I", 0.0), values.get("J", 0.0)]) * unit
-            middle = middle if self._centre_absolute else start + middle
+            middle = start + np.array([values_m.get("I", 0.0), values_m.get("J", 0.0)])
         (r0, a0), (r1, a1) = ((float(np.hypot(*d)), math.atan2(d[1], d[0]))
                               for d in (start - middle, end - middle))
-        if not r0 > 0 or abs(r1 - r0) > max(5e-6, 1e-3 * r0):
-            raise InputError(where, "the ends of the arc are not equally far from its centre",
-                             "check I, J, X, Y")
-        sweep = sense * ((sense * (a1 - a0)) % (2 * math.pi))
-        if abs(sweep) < 1e-9:
-            sweep = sense * 2 * math.pi
+        sweep = sense * (a1 - a0) % (2 * math.pi) if half else 2 * math.pi
+        if not r0 > 0 or abs(r1 - r0) > self._tolerance_m / 2 or (
+                half and not NO_TURN_RAD < sweep < 2 * math.pi - NO_TURN_RAD):
+            self._refuse(f"the ends of the arc are {r0 * 1e3:.6f} and {r1 * 1e3:.6f} mm from its "
+                         f"centre, and it turns by {math.degrees(sweep):.3f} deg", "give more "
+                         "digits or a larger --tolerance; write what is as good as straight as G1")
         limit = min(1.0, OF_SAMPLES * self._tolerance_m / r0)
-        count = abs(sweep) / min(2 * math.acos(1 - limit), self._step_m / r0)
-        t = np.linspace(0, 1, _few(math.ceil(count), where) + 1)
-        radius_at, angle = r0 + (r1 - r0) * t, a0 + sweep * t
-        path = middle + radius_at[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        count = self._few(sweep / min(2 * math.acos(1 - limit), self._step_m / r0))
+        t = np.linspace(0, 1, count + 1)
+        radii, angles = r0 + (r1 - r0) * t, a0 + sense * sweep * t
+        path = middle + radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         path[0], path[-1] = start, end
-        return path
+        return path, abs(r1 - r0)
 
-    def _lines(self, words: list[Word], values: dict[str, float], points: np.ndarray,
-               share: np.ndarray, where: str) -> list[str]:
-        """Return a line for each piece; the first keeps the words of the original one."""
-        arc, one = self._motion in ("2", "3"), len(points) == 1
-        ends = self._ends(values)
-        late = [] if one else [w for w in words if w.letter == "M" and w.code in AT_END]
-        lines, before = [], 0.0
-        for number, (point, part) in enumerate(zip(points.tolist(), share.tolist(), strict=True)):
-            texts = self._coordinates(point, where)
-            for axis in OTHERS if not one else "":
-                if axis in values:
-                    texts[axis] = self._shared(axis, values, ends, (before, part), where)
-            if number == 0:
-                lines.append(_line([w for w in words if w not in late], texts, arc=arc))
-            else:
-                lines.append(" ".join(axis + text for axis, text in texts.items()))
-            before = part
-        return [*lines[:-1], " ".join([lines[-1], *(w.text for w in late)])]
+    def _few(self, count: float) -> int:
+        if count > MAX_SAMPLES:
+            self._refuse("the move is too long for this tolerance", "give a larger one")
+        return max(math.ceil(count), 1)
 
-    def _coordinates(self, point: list[float], where: str) -> dict[str, str]:
+    @property
+    def _digits(self) -> int:
+        return self._decimals + (self._said["unit"] == "G20")
+
+    def _coordinates(self, point: Sequence[float]) -> dict[str, str]:
         """Return X and Y of a command as text; increments are those of the rounded positions."""
-        digits = self._decimals + self._inch
-        now = (round(point[0], digits), round(point[1], digits))
-        last, self._sent = self._sent, now
-        if self._absolute:
-            return {axis: _text(value, digits) for axis, value in zip("XY", now, strict=True)}
-        if last is None:
-            raise InputError(where, "the position before this line is not known",
-                             "begin with an absolute move of X and Y")
-        return {axis: _text(value - old, digits)
+        now = (round(point[0], self._digits), round(point[1], self._digits))
+        last, self._sent = self._sent if self._relative("X") else (0.0, 0.0), now
+        return {axis: _text(value - old, self._digits)
                 for axis, value, old in zip("XY", now, last, strict=True)}
 
-    def _shared(self, axis: str, values: dict[str, float], ends: dict[str, float],
-                parts: tuple[float, float], where: str) -> str:
+    def _shared(self, axis: str, value: float, parts: tuple[float, float]) -> str:
         """Return another axis's word for the part of a move from and to these shares."""
-        digits = self._decimals + self._inch + 1
-        if not self._is_absolute(axis):
-            done, to_do = (round(values[axis] * part, digits) for part in parts)
-            return _text(to_do - done, digits)
-        if axis not in self._at:
-            raise InputError(where, f"{axis} before this line is not known, and the move is split",
-                             f"command {axis} alone first")
-        start = self._at[axis]
-        return _text(start + (ends[axis] - start) * parts[1], digits)
-
-
-def _few(count: int, where: str) -> int:
-    if count > MAX_SAMPLES:
-        raise InputError(where, "the move is too long for this tolerance", "give a larger one")
-    return max(count, 1)
+        relative, start = self._relative(axis), self._at.get(axis, math.nan)
+        if relative is None or not (relative or math.isfinite(start)):
+            self._refuse(f"{axis} or its mode before this line is not known, and the move is split",
+                         f"command {axis} alone first" if relative is not None else
+                         "write M82 or M83 after the last G90 or G91")
+        if not relative:
+            return _text(start + (value - start) * parts[1], self._digits + 1)
+        done, to_do = (round(value * part, self._digits + 1) for part in parts)
+        return _text(to_do - done, self._digits + 1)
 
 
 def _text(value: float, digits: int) -> str:
@@ -359,42 +388,29 @@ def _text(value: float, digits: int) -> str:
     return "0.0" if float(text) == 0 else text
 
 
-def _as_line(word: Word) -> Word:
-    """Return G1 for G2 and G3: arcs become lines."""
-    is_arc = word.letter == "G" and word.code in ("2", "3")
-    return Word("G", "1", "G1") if is_arc else word
-
-
-def _line(words: list[Word], texts: dict[str, str], *, arc: bool) -> str:
-    """Return a line with other coordinates, the missing ones after the last of them."""
-    dropped = "IJKR" if arc else ""
-    kept = [_as_line(w) for w in words if not w.letter or w.letter not in dropped]
-    there = {w.letter for w in kept}
-    blank = " " * any(not w.letter and not w.text.strip() for w in words)
-    missing = "".join(f"{blank}{axis}{text}" for axis, text in texts.items() if axis not in there)
-    last = max((n for n, w in enumerate(kept) if w.letter in AXES and w.letter),
-               default=max(n for n, w in enumerate(kept) if w.letter))
-    out = ""
-    for number, word in enumerate(kept):
-        out += word.letter + texts[word.letter] if word.letter in texts else word.text
-        out += missing if number == last else ""
-    return out.rstrip()
+def _line(code: Code, words: Sequence[Word], texts: Mapping[str, str]) -> str:
+    """Return a line: number, G codes, coordinates, then all else in its order."""
+    axes = {**{word.letter: word.text[1:].strip() for word in words}, **texts}
+    dropped = {*"NGXYZE"} if code.does == "hole" else {*"NGXYZEIJR"}
+    first = [word.text for word in words if word.letter == "N" or (
+        word.letter == "G" and word.name not in (code.name, "G2", "G3"))]
+    last = [word.text for word in words if word.text.strip() and word.letter not in dropped]
+    places = [axis + axes[axis] for axis in "XYZE" if axis in axes]
+    return " ".join([*first, code.name, *places, *last])
 
 
 def simplified(path: np.ndarray, tolerance_m: float) -> np.ndarray:
-    """Return the indices of points whose polygon has all points within a tolerance (Douglas)."""
+    """Return the indices of points between which motion at an even pace is within a tolerance."""
     keep, waiting = {0, len(path) - 1}, [(0, len(path) - 1)]
     while waiting:
         i, j = waiting.pop()
         if j - i < 2:
             continue
-        chord, inner = path[j] - path[i], path[i + 1:j] - path[i]
-        length2 = float(chord @ chord)
-        along = np.clip(inner @ chord / length2, 0, 1) if length2 > 0 else np.zeros(len(inner))
-        off = np.hypot(*(inner - along[:, None] * chord).T)
-        worst = int(off.argmax())
-        if off[worst] > tolerance_m:
-            middle = i + 1 + worst
+        inner = np.arange(i + 1, j)
+        even = path[i] + (inner - i)[:, None] / (j - i) * (path[j] - path[i])
+        off = np.hypot(*(path[inner] - even).T)
+        if off.max() > tolerance_m:
+            middle = int(inner[off.argmax()])
             keep.add(middle)
             waiting += [(i, middle), (middle, j)]
     return np.array(sorted(keep))

@@ -277,7 +277,7 @@ RUNS = {
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
-    "export": "export siemens R -o f.ini", "gcode": "gcode NC R -o o.nc",
+    "export": "export siemens R -o f.ini", "gcode": "gcode NC R -o o.nc --dialect grbl",
     "cal verify": "cal verify R f.cal",
     "cal accuracy": "cal accuracy R",
     "cal straightness": "cal straightness R -o s.cal",
@@ -301,7 +301,7 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
               "DETAILS": simulated_details(tmp_path),
               "DATA": root / "config/step_diagonal/case_study.csv"}
     Path("p.csv").write_text("x,y\n0,0\n")
-    Path("in.nc").write_text("G0 X0 Y0\n")
+    Path("in.nc").write_text("G21 G90\nG0 X0 Y0\n")
     assert set(RUNS) | NEEDS_NODES | set(ELSEWHERE) == set(LEAVES)
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]

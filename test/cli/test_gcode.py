@@ -16,24 +16,25 @@ from selfcal_ros.outputs import write_json
 from test.support.maps import random_map, result_of
 
 MAP = random_map(Artifact(5, 0.01), 3)
+SAID = "G21 G90\n"
 
 
 @pytest.fixture(autouse=True)
 def desk(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_json("R.json", result_to_dict(result_of(MAP)))
-    Path("in.nc").write_text("G0 X0 Y0 ; begin\nG1 X10 F100\n")
+    Path("in.nc").write_text(f"{SAID}G0 X0 Y0 ; begin\nG1 X10 F100\n")
 
 
 def run(line: str) -> int:
-    return main(["gcode", *line.split()])
+    return main(["gcode", "--dialect", "grbl", *line.split()])
 
 
 def test_points_are_commanded_with_the_error_added(capsys):
     assert run("in.nc R.json -o out.nc --decimals 6") == 0
     assert capsys.readouterr().out == "written: out.nc, 2 moves as 2\n"
     form = r"; command: selfcal .*\n; result: R.json\n; sha256 of the result: \w{64}\n" \
-        r"G0 X(\S+) Y(\S+) ; begin\nG1 X(\S+) Y(\S+) F100\n"
+        r"G21 G90\nG0 X(\S+) Y(\S+) ; begin\nG1 X(\S+) Y(\S+) F100\n"
     found = map(float, re.fullmatch(form, Path("out.nc").read_text()).groups())
     assert list(found) == pytest.approx([
         1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2], 10 + 1e3 * MAP.gx[3, 2], 1e3 * MAP.gy[3, 2]],
@@ -44,15 +45,15 @@ def test_points_are_commanded_with_the_error_added(capsys):
     ("--home-x -10 --home-y 20", (1, 4), 1), ("--reverse-x --home-x 10", (3, 2), -1)])
 def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys):
     assert run(f"in.nc R.json -o - --decimals 6 {options}") == 0
-    first = capsys.readouterr().out.splitlines()[3].split()
+    first = capsys.readouterr().out.splitlines()[4].split()
     assert float(first[1][1:]) == pytest.approx(sign * 1e3 * MAP.gx[site], abs=6e-7)
     assert float(first[2][1:]) == pytest.approx(1e3 * MAP.gy[site], abs=6e-7)
 
 
 def test_inches_without_a_word_for_them_are_told(capsys):
-    Path("in.nc").write_text("G0 X0.3937007874 Y0\n")
+    Path("in.nc").write_text("G90\nG0 X0.3937007874 Y0\n")
     assert run("in.nc R.json -o - --unit in --json --decimals 7") == 0
-    word = json.loads(capsys.readouterr().out)["program"].splitlines()[3].split()[1]
+    word = json.loads(capsys.readouterr().out)["program"].splitlines()[4].split()[1]
     assert float(word[1:]) * 0.0254 == pytest.approx(0.01 + MAP.gx[3, 2], abs=1e-10)
 
 
@@ -60,7 +61,9 @@ def test_inches_without_a_word_for_them_are_told(capsys):
     ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
     ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
     ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
-    ("bad.nc R.json -o o.nc", "bad.nc:1: G92 moves the coordinates")])
+    ("in.nc R.json -o o.nc --decimals 2", "--decimals: 2 round by more than 1 um; give more"),
+    ("in.nc R.json -o o.nc --unit in --dialect klipper", "--unit: programs for klipper are in mm"),
+    ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes")])
 def test_what_is_not_possible_is_one_line(capsys, line, message):
     Path("bad.nc").write_text("G92 X0 Y0\n")
     assert run(line) == 2
@@ -74,3 +77,18 @@ def test_not_qualified_is_code_5(capsys):
         Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))))
     assert run("in.nc R.json -o o.nc") == 5
     assert "too noisy" in capsys.readouterr().err and Path("o.nc").exists()
+
+
+def test_a_dialect_must_be_named(capsys):
+    with pytest.raises(SystemExit) as left:
+        main(["gcode", "in.nc", "R.json", "-o", "o.nc"])
+    assert left.value.code == 2 and "--dialect" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("end", "leaves"), [("20", False), ("20.001", True), ("-20.5", True)])
+def test_moves_beyond_the_field_are_named(end, leaves, capsys):
+    """The field is 40 mm wide."""
+    Path("in.nc").write_text(f"{SAID}G0 X0 Y0\nG0 X{end}\n")
+    assert run("in.nc R.json -o o.nc") == 0
+    assert ("in.nc: moves leave the field" in capsys.readouterr().err) == leaves
+    assert ("; moves leave the field" in Path("o.nc").read_text()) == leaves
