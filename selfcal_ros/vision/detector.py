@@ -2,16 +2,18 @@
 """Mark detections of images: candidates, fits, reasons of rejection, offsets in stage axes."""
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.vision.finding import Candidate, candidates
-from selfcal_ros.vision.fitting import Fit, fitted, window_of
+from selfcal_ros.vision.fitting import Fit, Windows, fit_marks, lie_inside, windows_of
 from selfcal_ros.vision.images import Picture
 from selfcal_ros.vision.models import MODELS
 
@@ -111,41 +113,69 @@ class MarkDetector:
             If there are more possible marks than `max_marks`.
         """
         image, full = picture.values, self.settings.full_scale or picture.full_scale
+        seen = candidates(image, mark=self.settings.mark, size=self.size, width=self._width,
+                          sign=self._sign, most=self.settings.max_marks)
         found: list[Mark] = []
         faults: Counter[str] = Counter()
-        for candidate in candidates(image, mark=self.settings.mark, size=self.size,
-                                    width=self._width, sign=self._sign,
-                                    most=self.settings.max_marks):
-            mark = self._mark(image, candidate, full)
-            if isinstance(mark, Mark) and any(
-                    np.hypot(mark.u - other.u, mark.v - other.v) < SAME * self.size
-                    for other in found):
-                mark = Fault.DOUBLE
+        for mark in _without_doubles(self._fitted(image, seen, full), SAME * self.size):
             if isinstance(mark, Mark):
                 found.append(mark)
             else:
                 faults[str(mark)] += 1
         return found, faults
 
-    def _mark(self, image: np.ndarray, candidate: Candidate, full: int) -> Mark | Fault:
+    def _fitted(self, image: np.ndarray, seen: list[Candidate], full: int) -> list[Mark | Fault]:
+        """Return the mark at each candidate, or why there is none.
+
+        Each is fitted again in a window centred on a first fit, so that nothing depends on the
+        candidate.
+        """
+        if not seen:
+            return []
+        out: list[Mark | Fault] = [Fault.NO_FIT] * len(seen)
+        columns, rows = (np.array([getattr(candidate, name) for candidate in seen], dtype=int)
+                         for name in ("column", "row"))
+        blur = max(1.0, FIRST_BLUR * self.size)
+        starts = np.array([self._model.start(self.size, self._width, candidate.angle, blur)
+                           for candidate in seen])
+        waiting, moved = np.arange(len(seen)), False
+        while len(waiting):
+            again = []
+            for index, fit in self._fits(image, (columns, rows), starts, waiting, full):
+                if isinstance(fit, Fault):
+                    out[index] = fit
+                    continue
+                du, dv = (round(float(away)) for away in fit.centre)
+                if moved or not (du or dv):
+                    out[index] = self._mark(fit, int(columns[index]), int(rows[index]))
+                    continue
+                columns[index] += du
+                rows[index] += dv
+                starts[index] = list(fit.shape.values())
+                again.append(index)
+            waiting, moved = np.array(again, dtype=int), True
+        return out
+
+    def _fits(self, image: np.ndarray, at: tuple[np.ndarray, np.ndarray], starts: np.ndarray,
+              which: np.ndarray, full: int) -> Iterator[tuple[int, Fit | Fault]]:
+        """Yield the fit of each candidate in `which`, or why there is none."""
+        columns, rows = at[0][which], at[1][which]
         radius = self._model.reach * self.size + 2
-        start = self._model.start(self.size, self._width, candidate.angle,
-                                  max(1.0, FIRST_BLUR * self.size))
-        column, row = candidate.column, candidate.row
-        while True:
-            window = window_of(image, column, row, radius)
-            if window is None:
-                return Fault.CUT_OFF
-            if (window.value >= full).mean() > SATURATED:
-                return Fault.SATURATED
-            fit = fitted(self._model, window, start)
-            if fit is None:
-                return Fault.NO_FIT
-            du, dv = (round(float(away)) for away in fit.centre)
-            if not (du or dv) or (column, row) != (candidate.column, candidate.row):
-                break  # centred on a first fit, so that nothing depends on the candidate
-            column, row = column + du, row + dv
-            start = np.array(list(fit.shape.values()))
+        inside = lie_inside(image, columns, rows, radius)
+        for index in which[~inside]:
+            yield int(index), Fault.CUT_OFF
+        windows = windows_of(image, columns[inside], rows[inside], radius)
+        saturated = (windows.values >= full).mean(axis=1) > SATURATED
+        for index in which[inside][saturated]:
+            yield int(index), Fault.SATURATED
+        left = which[inside][~saturated]
+        fits = fit_marks(self._model, Windows(windows.disc, windows.values[~saturated]),
+                         starts[left])
+        for index, fit in zip(left, fits, strict=True):
+            yield int(index), Fault.NO_FIT if fit is None else fit
+
+    def _mark(self, fit: Fit, column: int, row: int) -> Mark | Fault:
+        """Return the mark of a fit in the window at a pixel, or why it is rejected."""
         fault = self._fault(fit)
         if fault is not None:
             return fault
@@ -182,6 +212,21 @@ class MarkDetector:
             out.append(Detection(stamp_ns, int(Kind.GRID), False, 0, 0, 0, x, y, 0.0, sigma,
                                  mark.score))
         return out, faults
+
+
+def _without_doubles(marks: list[Mark | Fault], near: float) -> list[Mark | Fault]:
+    """Return the marks; one that lies nearer than `near` to an earlier one is a double, px."""
+    places = np.array([(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan)
+                       for mark in marks]).reshape(len(marks), 2)
+    known = np.flatnonzero(np.isfinite(places[:, 0]))
+    out = list(marks)
+    if len(known) < 2:
+        return out
+    pairs = known[KDTree(places[known]).query_pairs(near, output_type="ndarray")]
+    for first, second in sorted(map(tuple, np.sort(pairs, axis=1)), key=lambda pair: pair[::-1]):
+        if isinstance(out[first], Mark):
+            out[second] = Fault.DOUBLE
+    return out
 
 
 def offset(u: float, v: float, shape: tuple[int, ...], settings: DetectorSettings,

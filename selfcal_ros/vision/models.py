@@ -21,7 +21,14 @@ ERF_SERIES = (0.5307027145, -0.7265760135, 0.7107068705, -0.142248368, 0.1274147
 """Abramowitz and Stegun, 7.1.26: p and half of a5 to a1, for the normal distribution."""
 
 Shaped = tuple[np.ndarray, np.ndarray]
-"""Value (n,) and derivatives (2 + parameters, n): centre u, centre v, then its parameters."""
+"""Value (n,) and derivatives (2 + parameters, n): centre u, centre v, then its parameters.
+
+Of many marks at once (marks, n) and (2 + parameters, marks, n), from parameters (parameters,
+marks, 1).
+"""
+
+Value = float | np.ndarray
+"""A parameter: of one mark, or (marks, 1) of many."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class MarkModel:
     turns: float
 
 
-def _edge(distance: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _edge(distance: np.ndarray, blur: Value) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a blurred step, 0 at negative distances, its slope, and its derivative by the blur.
 
     The normal distribution is Abramowitz and Stegun's 7.1.26, within 1e-7: a third of the time of
@@ -71,9 +78,9 @@ def _edge(distance: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray, np
     return np.where(distance > 0, 1 - tail, tail), bell, bell * distance * (-blur / variance)
 
 
-def _bars(along: np.ndarray, sides: tuple[float, float], blur: float) -> tuple[np.ndarray, ...]:
+def _bars(along: np.ndarray, sides: tuple[Value, Value], blur: Value) -> tuple[np.ndarray, ...]:
     """Return blurred bars of two lengths, and their derivatives by position, length and blur."""
-    half = np.array(sides).reshape(2, *[1] * along.ndim) / 2
+    half = np.stack(np.broadcast_arrays(*map(np.atleast_1d, sides)))[:, None] / 2
     ends, slopes, by_blur = _edge(np.stack([along + half, along - half]), blur)
     return (ends[0] - ends[1], slopes[0] - slopes[1], (slopes[0] + slopes[1]) / 2,
             by_blur[0] - by_blur[1])
@@ -97,8 +104,8 @@ def _ring(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
         outward * u, outward * v, change / 2, slope[1], by_blur[0] - by_blur[1]])
 
 
-def _turned(u: np.ndarray, v: np.ndarray, angle: float,
-            ) -> tuple[np.ndarray, np.ndarray, float, float]:
+def _turned(u: np.ndarray, v: np.ndarray, angle: Value,
+            ) -> tuple[np.ndarray, np.ndarray, Value, Value]:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * u + sine * v, cosine * v - sine * u, cosine, sine
 

@@ -4,8 +4,15 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.vision.fitting import fitted, window_of
+from selfcal_ros.vision.fitting import fit_marks, windows_of
 from selfcal_ros.vision.models import MODELS
+
+
+def fitted(model, image, middle, *, radius, start):
+    """Return the fit of one mark in the middle of a square image."""
+    at = np.array([middle])
+    fit, = fit_marks(model, windows_of(image, at, at, radius), start[None])
+    return fit
 
 
 def test_bright_pixels_that_are_noisier_weigh_less():
@@ -17,7 +24,7 @@ def test_bright_pixels_that_are_noisier_weigh_less():
         shape = model.shape((u - 30 - away[0]).ravel(), (v - 30 - away[1]).ravel(),
                             np.array([24.0, 3.0]))[0].reshape(u.shape)
         image = 200 - 150 * shape + rng.normal(size=u.shape) * (20 - 19 * shape)
-        fit = fitted(model, window_of(image, 30, 30, 20.0), np.array([24.0, 2.0]))
+        fit = fitted(model, image, 30, radius=20.0, start=np.array([24.0, 2.0]))
         ratios.append((fit.centre - away) / np.sqrt(np.diagonal(fit.covariance)))
     square = np.square(ratios)
     assert abs(square.mean() - 1) < 4 * np.sqrt(2 / square.size)
@@ -32,6 +39,6 @@ def test_windows_without_a_mark_are_no_error(mark):
     for size in rng.uniform(6, 24, 20):
         for image in (u * 0 + 7, u, (u > 20) * 100, rng.integers(0, 2, u.shape) * 255,
                       (np.hypot(u - 20, v - 20) < 1) * 255, np.sin(u) * np.sin(v)):
-            window = window_of(image, 20, 20, min(model.reach * size + 2, 20.0))
-            fit = fitted(model, window, model.start(size, size / 5, 0.1, 1.0))
+            fit = fitted(model, image, 20, radius=min(model.reach * size + 2, 20.0),
+                         start=model.start(size, size / 5, 0.1, 1.0))
             assert fit is None or fit.centre.shape == (2,)
