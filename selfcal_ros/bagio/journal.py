@@ -34,6 +34,8 @@ from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
+JOURNAL = re.compile(r"journal_\d{8}T\d{6}Z(_\d+)?")
+"""Name of a journal's folder. Others in the same place are recordings of somebody else."""
 SYNC_PERIOD_S = 0.5
 """Period of synchronisation with the disk, if there is anything to synchronise."""
 OVER = (Phase.DONE, Phase.ABORT)
@@ -119,7 +121,7 @@ def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[P
         found = journal or _newest(bag)[1]
         if found is None:
             return []
-        bag, files = found, sorted(found.glob("*.mcap"), key=_number)
+        bag, files = found, _files(found)
         commands = [command for file in files
                     for command in _commands(scan_file(file, COMMAND_TOPIC), str(file))]
     except OSError as error:
@@ -348,7 +350,7 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
     """Complete the existing files; return their metadata, and their commands by stamp."""
     metadata = Metadata()
     commands: list[tuple[int, Phase]] = []
-    for file in sorted(bag.glob("*.mcap"), key=_number):
+    for file in _files(bag):
         content = finish_file(file, COMMAND_TOPIC)
         metadata.files.append(content.entry)
         for channel in content.channels.values():
@@ -381,14 +383,18 @@ def _locked(path: Path) -> int:
 
 
 def _newest(folder: Path) -> tuple[int, Path | None]:
-    """Return the last time of writing, ns, of a bag folder in `folder`, and that bag folder."""
+    """Return the last time of writing, ns, of a journal in `folder`, and that journal."""
     found: list[tuple[int, Path]] = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for bag in folder.iterdir():
-            with suppress(NotADirectoryError):
-                found += [(file.stat().st_mtime_ns, bag) for file in bag.iterdir()
-                          if file.suffix == ".mcap"]
+            if JOURNAL.fullmatch(bag.name):
+                found += [(file.stat().st_mtime_ns, bag) for file in _files(bag)]
     return max(found, default=(0, None))
+
+
+def _files(bag: Path) -> list[Path]:
+    """Return the files of a journal in their order."""
+    return sorted(bag.glob(f"{bag.name}_*.mcap"), key=_number)
 
 
 def _number(file: Path) -> tuple[int, str]:

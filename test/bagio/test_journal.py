@@ -24,7 +24,7 @@ from selfcal_ros.bagio.mcap_stream import McapStream
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
-from selfcal_ros.bagio.writer import build
+from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
@@ -266,6 +266,23 @@ def test_the_journal_written_last_counts(tmp_path):
     os.utime(next(old.path.glob("*.mcap")), ns=(NOW + 5, NOW + 5))
     with resume(tmp_path) as again:
         assert again.path == old.path
+
+
+@pytest.mark.parametrize("name", ["session", "journal", "journal_of_mine",
+                                  "journal_20261127T102030Z_copy"])
+def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
+    """Written last and of an unfinished run, as by a recorder that runs."""
+    with declared(BagWriter(tmp_path / name)) as recorder:
+        topic, data = raw(command(Phase.PLACE, NOW))
+        recorder.write_raw(topic, data, NOW + 5)
+    before = {file: file.read_bytes() for file in (tmp_path / name).iterdir()}
+    assert (resume(tmp_path), unfinished(tmp_path), journal.newest(tmp_path)) == (None, [], None)
+    with declared(start(tmp_path, NOW)) as writer:
+        record(writer, [command(Phase.PLACE, NOW)])
+    os.utime(next((tmp_path / name).glob("*.mcap")))
+    with resume(tmp_path) as again:
+        assert again.path == writer.path
+    assert {file: file.read_bytes() for file in (tmp_path / name).iterdir()} == before
 
 
 def test_a_journal_has_one_writer(tmp_path):
