@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Message, Schema
 
-from selfcal_ros.bagio.mcap_stream import McapStream
+from selfcal_ros.bagio.mcap_stream import streams
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
@@ -261,8 +261,7 @@ class ImageBag:
         self._files = reader.files
         self.lost.update(reader.lost)
         found: dict[str, str] = {}
-        for file in self._files:
-            stream = McapStream(file, wanted=lambda topic: False)
+        for stream in streams(self._files, [], lambda topic: False):
             for _ in stream.blocks():
                 pass  # blocks of a file without an index
             found |= {channel.topic: transport for channel in stream.channels.values()
@@ -300,16 +299,15 @@ class ImageBag:
         InputError
             If the topic of the images has another type.
         """
-        for file in self._files:
-            lines: list[str] = []
-            stream = McapStream(file, lost=lines)
+        lines: list[str] = []
+        for stream in streams(self._files, lines):
             for channel, message in stream.messages():
                 schema = stream.schemas.get(channel.schema_id)
                 item = Item(channel, schema, message, bool(self._transport(channel.topic)))
                 if channel.topic == self.topic:
                     item.image = self._decoded(channel, schema, message)
                 yield item
-            self.lost.update(lines)
+        self.lost.update(lines)
 
     def cdr_images(self) -> Iterator[tuple[str, int, bytes]]:
         """Yield the topic's name of the contract, log time in ns and CDR bytes of each image.

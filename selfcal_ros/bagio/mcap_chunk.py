@@ -45,6 +45,8 @@ END = struct.Struct("<BQQQI8s")
 FOOTER_SIZE = 20
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""
+JOINT = MAGIC + bytes([Opcode.HEADER])
+"""First bytes of a file, also within one that was made by joining files."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +125,15 @@ def message_block(data: bytes, at: int) -> tuple[Block, int]:
 def stretch(file: BinaryIO, at: int, size: int) -> tuple[Block | None, int]:
     """Return the messages outside chunks from `at` on and their end, or None.
 
-    Nothing is read from byte `size` on.
+    Nothing is read from byte `size` on, nor from where a file that was joined to it begins.
     """
     file.seek(at)
     if file.read(1) != bytes([Opcode.MESSAGE]):
         return None, at
     file.seek(at)
-    block, end = message_block(file.read(min(STRETCH, size - at)), 0)
+    data = file.read(min(STRETCH, size - at))
+    joint = data.find(JOINT)
+    block, end = message_block(data if joint < 0 else data[:joint], 0)
     return (block if len(block) else None), at + end
 
 

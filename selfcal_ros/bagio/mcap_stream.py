@@ -4,12 +4,12 @@
 The mcap library reads the records other than messages. This module goes from record to record, so
 that after truncation or damage only the affected part is lost. Consecutive messages are
 yielded in blocks. Files and messages compressed by rosbag2 are decompressed. A file that is
-still being written is read up to its size when opened.
+still being written is read up to its size when opened. Files joined to one are read one by one.
 """
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -40,6 +40,20 @@ class _Cut(Exception):
     """The file ends within a record."""
 
 
+def streams(files: Iterable[Path], lost: list[str],
+            wanted: Callable[[str], bool] | None = None) -> Iterator["McapStream"]:
+    """Yield a stream for each file, and for each file joined to it (`cat A B`), to be read in turn.
+
+    Numbers of schemas and channels are those of one stream.
+    """
+    for file in files:
+        begin: int | None = 0
+        while begin is not None:
+            stream = McapStream(file, lost=lost, wanted=wanted, begin=begin)
+            yield stream
+            begin = stream.rest
+
+
 @dataclass
 class McapStream:
     """Messages of one MCAP file, in the order of the file.
@@ -48,6 +62,10 @@ class McapStream:
     ----------
     path : Path
         The file.
+    begin : int
+        Byte at which it begins; not 0 if it was joined to another file.
+    rest : int or None
+        Byte at which another file joined to it begins, after reading.
     schemas, channels : dict
         Filled while the messages are read.
     lost : list of str
@@ -61,6 +79,8 @@ class McapStream:
     channels: dict[int, Channel] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
     wanted: Callable[[str], bool] | None = None
+    begin: int = 0
+    rest: int | None = None
     _needless: dict[int, int] = field(default_factory=dict)
     _size: int = 0  # size of the file when opened
     _n_read: int = 0
@@ -88,12 +108,17 @@ class McapStream:
         """
         try:
             with mcap_salvage.plain_file(self.path, self.lost) as file:
-                head = file.read(len(mcap_chunk.MAGIC))
-                if head != mcap_chunk.MAGIC:
-                    raise self._refusal(head + file.read(len(SQLITE)))
                 self._size = file.seek(0, 2)
-                self._look_ahead(file)
-                yield from self._records(file)
+                file.seek(self.begin)
+                head = file.read(len(mcap_chunk.MAGIC))
+                if head == mcap_chunk.MAGIC:
+                    self._look_ahead(file)
+                    yield from self._records(file)
+                elif not self.begin:
+                    raise self._refusal(head + file.read(len(SQLITE)))
+                else:
+                    self.lost.append(f"{self._size - self.begin} bytes after the end of the "
+                                     "recording are not MCAP and were not used")
         except OSError as error:
             raise InputError(str(self.path), f"cannot be read ({error.strerror})",
                              "name a readable file") from error
@@ -116,7 +141,7 @@ class McapStream:
 
     def _look_ahead(self, file: BinaryIO) -> None:
         """Determine the chunks that can be skipped; their declarations are also in the summary."""
-        if self.wanted is None:
+        if self.wanted is None or self.begin:  # places in a summary count from the begin
             return
         summary = mcap_chunk.read_summary(file)
         self._needless = summary.needless(self.wanted)
@@ -126,12 +151,14 @@ class McapStream:
     def _records(self, file: BinaryIO) -> Iterator[mcap_chunk.Block]:
         """Go from record to record; records that begin before `sure` have been read."""
         size = self._size
-        at = sure = clean = len(mcap_chunk.MAGIC)
+        at = sure = clean = self.begin + len(mcap_chunk.MAGIC)
+        last = at  # the record before
         data_ended = passed = False
         while True:
             block, end = mcap_chunk.stretch(file, at, size)
             if block is not None:
-                sure, clean = at + int(block.payloads.start[-1]) - mcap_chunk.FRONT, end
+                last = sure = at + int(block.payloads.start[-1]) - mcap_chunk.FRONT
+                clean = end
                 at = end
                 yield from self._take(block)
                 continue
@@ -142,6 +169,9 @@ class McapStream:
             try:
                 opcode, record, end = _record(file, at, size)
             except Exception as error:  # a damaged record may fail anywhere in its parser
+                size = self._end_at_joint(file, last, size)
+                if at > size:  # the record before was cut off
+                    at = sure = last
                 if data_ended or at == size == clean:
                     self._say_end(file, data_ended)
                     return
@@ -153,8 +183,12 @@ class McapStream:
                     return
                 continue
             if opcode == Opcode.FOOTER:
+                file.seek(end)
+                end += 0 if file.read(len(mcap_chunk.JOINT)) == mcap_chunk.JOINT else len(mcap_chunk.MAGIC)
+                self.rest = end if end < size else None
                 return
             data_ended = data_ended or opcode == Opcode.DATA_END
+            last = at
             if opcode in CHECKED:  # only the record after a message confirms its length
                 sure, clean = at if opcode == Opcode.MESSAGE else end, end
             if passed and opcode == Opcode.MESSAGE_INDEX:
@@ -162,11 +196,24 @@ class McapStream:
             at = end
             if isinstance(record, Chunk):
                 self._chunked, passed = True, False
-                yield from self._chunk(file, record, end)
+                yield from self._chunk(file, record, (last, end))
+                if self.rest is not None:
+                    return
             elif record is not None:
                 yield from self._take(record)
 
-    def _chunk(self, file: BinaryIO, chunk: Chunk, position: int) -> Iterator[mcap_chunk.Block]:
+    def _end_at_joint(self, file: BinaryIO, start: int, stop: int) -> int:
+        """End a file without its footer where one that was joined to it begins; return the end."""
+        with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
+            joint = data.find(mcap_chunk.JOINT, start, stop + len(mcap_chunk.JOINT) - 1)
+        if joint >= 0:
+            self._size = self.rest = joint
+        return self._size
+
+    def _chunk(self, file: BinaryIO, chunk: Chunk, place: tuple[int, int],
+               ) -> Iterator[mcap_chunk.Block]:
+        """Yield the messages of a chunk between two bytes of the file."""
+        start, position = place
         try:
             items = mcap_chunk.chunk_items(chunk)
         except mcap_salvage.TooLargeError as error:
@@ -174,6 +221,10 @@ class McapStream:
             self._declare(file)
             return
         except Exception as error:
+            self._end_at_joint(file, start, position)
+            if self.rest is not None:
+                yield from self._salvage(file, start, _Cut())
+                return
             self.lost.append(f"the chunk that ends at byte {position} is damaged "
                              f"({first_line(error)[:80]}): its messages are lost")
             self._declare(file)
@@ -236,7 +287,7 @@ class McapStream:
 
     def _grown(self, file: BinaryIO) -> str:
         """Return a note if a file has grown since it was opened, else ""."""
-        if file.seek(0, 2) == self._size:
+        if file.seek(0, 2) == self._size or self.rest is not None:
             return ""
         return (f"the file is still being written: the messages in its first {self._size} bytes "
                 "are read")
@@ -302,11 +353,13 @@ def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None,
         raise _Cut
     if opcode >= 0x80 or opcode == Opcode.ATTACHMENT:
         return opcode, None, at + mcap_salvage.HEAD.size + length
+    body = file.read(length)
+    if opcode != Opcode.CHUNK and mcap_chunk.JOINT in body + file.read(len(mcap_chunk.JOINT) - 1):
+        raise _Cut
     if opcode == Opcode.MESSAGE_INDEX:
-        if INDEX.unpack(file.read(INDEX.size))[1] != length - INDEX.size:
+        if INDEX.unpack_from(body)[1] != length - INDEX.size:
             raise ValueError("the length of a message index is wrong")
         return opcode, None, at + mcap_salvage.HEAD.size + length
-    body = file.read(length)
     record, used = mcap_salvage.parsed(opcode, body)
     # a chunk ends where its records do, even if the length before it says more
     size = used if opcode == Opcode.CHUNK else length

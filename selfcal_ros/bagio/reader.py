@@ -11,7 +11,7 @@ import numpy as np
 from mcap.records import Channel
 
 from selfcal_ros.bagio.mcap_chunk import Block
-from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream
+from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream, streams
 from selfcal_ros.bagio.schemas import (
     ChannelDecoder,
     Input,
@@ -98,12 +98,18 @@ class BagReader:
             raise InputError(str(self.path), "neither a file nor a folder",
                              "give an MCAP file or a rosbag2 folder")
         there = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
-        names = self._listed() or sorted(
-            (name for name in there if name.removesuffix(".zstd") not in there - {name}),
-            key=_natural)
-        for name in names:
+        found = sorted((name for name in there
+                        if name.removesuffix(".zstd") not in there - {name}), key=_natural)
+        listed = self._listed()
+        names = listed if there.intersection(listed) else found  # the files may have been renamed
+        for name in listed:
             if name not in there:
                 self.lost.append(f"the file {name}, which metadata.yaml lists, is missing")
+        plain = {name.removesuffix(".zstd") for name in names}
+        for name in found:
+            if name.removesuffix(".zstd") not in plain:
+                self.lost.append(f"the file {name}, which metadata.yaml does not list, was not "
+                                 "used")
         files = [self.path / name for name in names if name in there]
         if not files and any(p.suffix == ".db3" for p in self.path.iterdir()):
             raise InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
@@ -179,23 +185,20 @@ class BagReader:
                 yield queue.decoder.role, item
         self._say(bad)
 
-    def _stream(self, file: Path) -> McapStream:
-        return McapStream(file, lost=self.lost, wanted=lambda topic: bool(_roles(topic)))
-
     def _streams(self) -> Iterator[tuple[McapStream, Block]]:
         """Yield the blocks of all files; an unreadable file is skipped if another is readable."""
         refused: list[InputError] = []
         for file in self.files:
-            stream = self._stream(file)
-            try:
-                for block in stream.blocks():
-                    yield stream, block
-            except InputError as error:
-                refused.append(error)
-                self.lost.append(f"the file {file.name} was not read: {error.what}")
-            for channel in stream.channels.values():
-                schema = stream.schemas.get(channel.schema_id)
-                self.topics[channel.topic] = schema.name if schema else ""
+            for stream in streams([file], self.lost, lambda topic: bool(_roles(topic))):
+                try:
+                    for block in stream.blocks():
+                        yield stream, block
+                except InputError as error:
+                    refused.append(error)
+                    self.lost.append(f"the file {file.name} was not read: {error.what}")
+                for channel in stream.channels.values():
+                    schema = stream.schemas.get(channel.schema_id)
+                    self.topics[channel.topic] = schema.name if schema else ""
         if len(refused) == len(self.files):
             raise refused[0]
 
@@ -203,11 +206,11 @@ class BagReader:
                 ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
         watches = {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
-        decoders: dict[tuple[Path, int], ChannelDecoder | None] = {}
+        decoders: dict[tuple[Path, int, int], ChannelDecoder | None] = {}
         for stream, block in self._streams():
             parts = []
             for number in block.channels():
-                key = (stream.path, number)
+                key = (stream.path, stream.begin, number)
                 if key not in decoders:
                     decoders[key] = self._decoder(stream, stream.channels[number], bad)
                 decoder = decoders[key]

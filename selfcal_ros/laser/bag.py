@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.bagio.mcap_stream import McapStream
+from selfcal_ros.bagio.mcap_stream import McapStream, streams
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import store_of_schema
 from selfcal_ros.errors import InputError, NoDataError
@@ -70,8 +70,7 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
     found: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in wanted}
     others: set[str] = set()
     unstamped: set[str] = set()
-    for file in reader.files:
-        stream = McapStream(file, lost=reader.lost)
+    for stream in streams(reader.files, reader.lost):
         decoders: dict[int, Callable] = {}
         for channel, message in stream.messages():
             topic = _match(channel.topic, wanted)

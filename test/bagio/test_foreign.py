@@ -124,6 +124,62 @@ def test_a_bag_in_many_files_whose_channels_differ(tmp_path, events, expected, m
     check(tmp_path / "bag", expected)
 
 
+@pytest.mark.parametrize("compression", [None, "zstd"])
+def test_files_joined_to_one_are_all_read(tmp_path, events, expected, compression):
+    """As by `cat A B`; the numbers of channels differ between them."""
+    joined = b""
+    for number, part in enumerate(bags.split(events, 3)):
+        file = Foreign(others=True).write(tmp_path / f"{number}.mcap", part, order=number)
+        joined += file.read_bytes()
+    if compression:
+        joined = zstandard.compress(joined)
+    (tmp_path / "bag.mcap").write_bytes(joined)
+    check(tmp_path / "bag.mcap", expected)
+
+
+def test_a_file_without_its_end_joined_to_another_loses_no_more_than_that(tmp_path, events):
+    first, second = bags.split(events, 2)
+    one = Foreign({"chunk_size": 1500}).write(tmp_path / "1.mcap", first).read_bytes()
+    two = Foreign().write(tmp_path / "2.mcap", second, order=2).read_bytes()
+    for cut in (one.rindex(b"\x89MCAP0"), len(one) // 2, len(one) - 60, 1230, 2038, 9784):
+        (tmp_path / "cut.mcap").write_bytes(one[:cut])
+        (tmp_path / "bag.mcap").write_bytes(one[:cut] + two)
+        alone, reader = BagReader(tmp_path / "cut.mcap"), BagReader(tmp_path / "bag.mcap")
+        count = len(list(decoded(alone)))
+        assert len(list(decoded(reader))) == count + len(second)
+        assert len(reader.lost) == len(alone.lost) <= 1
+
+
+def test_what_follows_the_end_of_a_file_and_is_no_other_is_said(tmp_path, events, expected):
+    file = Foreign().write(tmp_path / "x.mcap", events)
+    file.write_bytes(file.read_bytes() + bytes(50))
+    result, lost = solved(file)
+    assert result == expected
+    assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
+
+
+def listing(bag, *files) -> None:
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(
+        {"rosbag2_bagfile_information": {"relative_file_paths": list(files)}}))
+
+
+def test_a_file_that_metadata_does_not_list_is_said(tmp_path, events, expected):
+    Foreign().write(tmp_path / "bag" / "a.mcap", events)
+    Foreign().write(tmp_path / "bag" / "b.mcap", events)
+    listing(tmp_path / "bag", "a.mcap")
+    result, lost = solved(tmp_path / "bag")
+    assert result == expected
+    assert lost == ["the file b.mcap, which metadata.yaml does not list, was not used"]
+
+
+def test_files_that_were_renamed_are_read(tmp_path, events, expected):
+    Foreign().write(tmp_path / "bag" / "renamed.mcap", events)
+    listing(tmp_path / "bag", "a.mcap")
+    result, lost = solved(tmp_path / "bag")
+    assert result == expected
+    assert lost == ["the file a.mcap, which metadata.yaml lists, is missing"]
+
+
 def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, expected):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
     (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(
