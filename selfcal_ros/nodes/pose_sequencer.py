@@ -109,9 +109,13 @@ class CalibrationAction:
             return
         answer = await self._save(
             self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id))
-        result.error_code, result.message = answer.error_code, answer.message
-        result.map_path = answer.path
-        goal.succeed() if answer.success else goal.abort()
+        result.message, result.map_path = answer.message, answer.path
+        if answer.success:
+            result.error_code = int(ExitCode.DONE)
+            goal.succeed()
+        else:
+            result.error_code = answer.error_code or int(ExitCode.INTERNAL)
+            goal.abort()
 
     async def _save(self, path: str) -> Any:
         """Return the solver's answer; NoDataError after a time-out."""

@@ -20,7 +20,7 @@ READY_FOR = 21
 
 SWEEP_S = 0.5
 """Period of checks for work without an event, such as a solution that was ready while
-the node was not active. A solution itself wakes the executor."""
+the node was not active, or a map to be saved again. A solution itself wakes the executor."""
 
 
 class Solver(ManagedNode[SolverSettings]):
@@ -56,7 +56,7 @@ class Solver(ManagedNode[SolverSettings]):
         """Subscribe to the collector and to the commands."""
         self.subscribe(names.MEASUREMENT, self._on_measurement)
         self.subscribe(names.COMMAND, self._on_command)
-        self.every(SWEEP_S, self._advance)
+        self.every(SWEEP_S, self._sweep)
         self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
         self._waiting.clear()
         self.service_later(SaveMap, "~/save_map", self._save, self._once_solved)
@@ -101,6 +101,10 @@ class Solver(ManagedNode[SolverSettings]):
                 self._begin()
             finally:
                 self._go_on()
+
+    def _sweep(self) -> None:
+        self._advance()
+        self.session.save_again()
 
     def _take(self, running: Future[Outcome]) -> None:
         """Take a solution."""

@@ -28,6 +28,10 @@ from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 
 
+RETRY_S = 10.0
+"""Time after which a result that could not be written is written again."""
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """Readings to be solved, with their identification; passed to a worker."""
@@ -121,6 +125,7 @@ class SolvingSession:
         self._stale = False
         self._left_aside = 0
         self._saved = ""  # absolute path of the published map
+        self._unsaved, self._tried_s = "", 0.0  # why it could not be written, and when
         self.shown = Shown()
 
     @property
@@ -260,7 +265,7 @@ class SolvingSession:
             return
         self.shown = Shown(outcome.result, outcome.problem, job.run, job.views_done,
                            job.stamp_ns, job.digest)
-        self._saved = ""
+        self._saved = self._unsaved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
@@ -278,9 +283,22 @@ class SolvingSession:
         try:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
             write_json(path, results.result_to_dict(results.created_now(result)))
-            self._saved = str(path)
         except InputError as error:  # the map itself is good, and save_map may use another path
-            self._ports.say(Level.ERROR, f"save_path: {error}")
+            self._tried_s = self._ports.now_s()
+            if not self._unsaved:
+                self._ports.say(Level.ERROR, f"save_path: {error}")
+            self._unsaved = f"the map is not saved: {error}"
+            return
+        self._saved = str(path)
+        if self._unsaved:
+            self._unsaved = ""
+            self._ports.say(Level.OK, f"the map is saved now: {path}")
+
+    def save_again(self) -> None:
+        """Write a result that could not be written, some time after the last attempt."""
+        if (self._unsaved and self.shown.result is not None
+                and self._ports.now_s() - self._tried_s >= RETRY_S):
+            self._save_by_itself(self.shown.result)
 
     def _publish(self, result: results.CalibrationResult) -> None:
         shown = self.shown
@@ -359,7 +377,7 @@ class SolvingSession:
         write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
         if problem is not None:
             raise problem
-        self._saved = str(target)
+        self._saved, self._unsaved = str(target), ""
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")
         line = f"saved to {target}: {named}; readings {self.digest() or 'of a loaded map'}"
@@ -382,7 +400,7 @@ class SolvingSession:
         result = read_result(path)
         self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
                            views_done=len({without_cell(view.name) for view in result.views}))
-        self._saved = ""
+        self._saved = self._unsaved = ""
         self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"
 
@@ -394,8 +412,9 @@ class SolvingSession:
         fine = (shown.problem is None or self._unfinished()) and (
             shown.problem is not None or shown.result is None or is_qualified(shown.result))
         state = self._state() if known else "waiting for views"
-        return Diagnosis(Level.OK if fine and not newer else Level.WARN,
-                         f"{newer}; {state}" if newer else state,
+        wrong = [line for line in (self._unsaved, newer) if line]
+        return Diagnosis(Level.OK if fine and not wrong else Level.WARN,
+                         "; ".join([*wrong, state]),
                          {"views": self._views_done, "readings": self.digest(),
                           "plan_id": self._run.plan_id, "run_id": self._run.run_id,
                           "left_aside": self._left_aside, "saved": self._saved})

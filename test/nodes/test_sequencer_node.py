@@ -359,6 +359,16 @@ def test_a_map_that_cannot_be_saved_fails_with_the_solvers_words(actor):
     assert (result.error_code, result.message, result.map_path) == (3, "modes are unseen", "")
 
 
+def test_a_result_has_code_0_only_if_it_is_done(actor):
+    """That of a goal which is not known, too: rclpy answers with an empty result."""
+    assert RunCalibration.Result().error_code == 1
+    actor.answer = SaveMap.Response(success=False, message="no reason")
+    handle = actor.send()
+    actor.measure_all()
+    status, result = actor.result(handle)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, 1)
+
+
 def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     actor = Actor(graph, tmp_path, save_timeout=0.1)
     held = []

@@ -27,7 +27,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, supersedes
 from selfcal_ros.sessions.compensating import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.solving import SolvingSession, solve
+from selfcal_ros.sessions.solving import RETRY_S, SolvingSession, solve
 from test.support.plans import image_plan
 from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
@@ -423,9 +423,37 @@ def test_a_map_that_cannot_be_saved_by_itself_is_still_published(tmp_path):
     desk = Desk(save_path=str(tmp_path / "no" / "map.json"), result_folder=str(tmp_path))
     desk.take(views_of())
     [line] = desk.hands.lines(Level.ERROR)
-    assert line.startswith(f"save_path: {tmp_path}/no/map.json: cannot be written")
+    problem = f"{tmp_path}/no/map.json: cannot be written"
+    assert line.startswith(f"save_path: {problem}")
     assert desk.hands.of("map")
+    told = desk.session.diagnosis()
+    assert told.level == Level.WARN and f"the map is not saved: {problem}" in told.message
     assert desk.session.save("map.json")[1] == str(tmp_path / "map.json")
+
+
+def test_a_map_that_could_not_be_saved_is_saved_once_there_is_space(tmp_path):
+    path = tmp_path / "no" / "map.json"
+    desk = Desk(save_path=str(path), result_folder=str(tmp_path))
+    desk.take(views_of())
+    desk.hands.pass_time(RETRY_S - 1)
+    desk.session.save_again()
+    desk.hands.pass_time(1)
+    desk.session.save_again()  # in vain, and not told again
+    assert len(desk.hands.lines(Level.ERROR)) == 1
+    path.parent.mkdir()
+    desk.hands.pass_time(RETRY_S - 1)
+    desk.session.save_again()
+    assert not path.exists()
+    desk.hands.pass_time(1)
+    desk.session.save_again()
+    assert json.loads(path.read_text())["plan_id"] == PLAN.plan_id
+    told = desk.session.diagnosis()
+    assert (told.level, told.values["saved"]) == (Level.OK, str(path))
+    assert desk.hands.lines(Level.OK)[-1] == f"the map is saved now: {path}"
+    path.unlink()
+    desk.hands.pass_time(2 * RETRY_S)
+    desk.session.save_again()
+    assert not path.exists()
 
 
 def test_only_regular_files_are_loaded(tmp_path):
