@@ -207,7 +207,7 @@ def message_lines(path: Path) -> list[str]:
     """Return the table of a message, service or action; its parts are divided by a row."""
     rows = []
     for line in path.read_text().splitlines():
-        found = re.match(r"([a-z]\S*)\s+(\w+(?:=\S+)?)\s*(?:#\s*(.*))?$", line)
+        found = re.match(r"([a-z]\S*)\s+(\w+(?:=\S+)?(?: \d+)?)\s*(?:#\s*(.*))?$", line)
         if found:
             rows.append((f"`{found[2]}`", f"`{found[1]}`", found[3] or ""))
         elif line == "---":

@@ -154,7 +154,7 @@ class McapStream:
         at = sure = clean = self.begin + len(mcap_chunk.MAGIC)
         last = at  # the record before
         data_ended = passed = False
-        while True:
+        while at <= self._size:
             block, end = mcap_chunk.stretch(file, at, size)
             if block is not None:
                 last = sure = at + int(block.payloads.start[-1]) - mcap_chunk.FRONT
@@ -170,8 +170,7 @@ class McapStream:
                 opcode, record, end = _record(file, at, size)
             except Exception as error:  # a damaged record may fail anywhere in its parser
                 size = self._end_at_joint(file, last, size)
-                if at > size:  # the record before was cut off
-                    at = sure = last
+                at, sure = (at, sure) if at <= size else (last, last)  # the one before is cut off
                 if data_ended or at == size == clean:
                     self._say_end(file, data_ended)
                     return
@@ -183,9 +182,7 @@ class McapStream:
                     return
                 continue
             if opcode == Opcode.FOOTER:
-                file.seek(end)
-                end += 0 if file.read(len(mcap_chunk.JOINT)) == mcap_chunk.JOINT else len(mcap_chunk.MAGIC)
-                self.rest = end if end < size else None
+                self._note_rest(file, end)
                 return
             data_ended = data_ended or opcode == Opcode.DATA_END
             last = at
@@ -197,10 +194,15 @@ class McapStream:
             if isinstance(record, Chunk):
                 self._chunked, passed = True, False
                 yield from self._chunk(file, record, (last, end))
-                if self.rest is not None:
-                    return
             elif record is not None:
                 yield from self._take(record)
+
+    def _note_rest(self, file: BinaryIO, end: int) -> None:
+        """Note what follows the footer that ends at `end`, and the magic after it."""
+        file.seek(end)
+        if file.read(len(mcap_chunk.JOINT)) != mcap_chunk.JOINT:
+            end += len(mcap_chunk.MAGIC)
+        self.rest = end if end < self._size else None
 
     def _end_at_joint(self, file: BinaryIO, start: int, stop: int) -> int:
         """End a file without its footer where one that was joined to it begins; return the end."""

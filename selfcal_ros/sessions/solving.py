@@ -27,7 +27,6 @@ from selfcal_ros.sessions.compensating import is_qualified, read_result, result_
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 
-
 RETRY_S = 10.0
 """Time after which a result that could not be written is written again."""
 
@@ -265,7 +264,7 @@ class SolvingSession:
             return
         self.shown = Shown(outcome.result, outcome.problem, job.run, job.views_done,
                            job.stamp_ns, job.digest)
-        self._saved = self._unsaved = ""
+        self._saved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
