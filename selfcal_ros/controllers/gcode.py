@@ -154,7 +154,7 @@ class Rewriter:
             match = token.match(text, at)
             if not match:
                 self._refuse(f"'{text[at]}' does not belong to a word of {self.dialect}",
-                             remedy(text[at]))
+                             remedy(text[at].upper()))
             words.append(Word((match["letter"] or "").upper(), float(match["value"] or "nan"),
                               match[0]))
             at = match.end()
@@ -201,7 +201,8 @@ class Rewriter:
         words = "".join(code.words for code in said) + ALWAYS * (not self._printer)
         for letter, value in values.items():
             if words.count(letter) != 1:
-                self._refuse(f"{letter} is not a word of {' '.join(code.name for code in said)}",
+                self._refuse(f"{letter} is not a word of "
+                             f"{' '.join(code.name for code in said) or self.dialect}",
                              remedy(letter))
             if math.isnan(value) and acts and acts[0].does not in ("home", "unknown"):
                 self._refuse(f"{letter} has no number", "give one")
