@@ -7,8 +7,8 @@ import sys
 import numpy as np
 
 from selfcal_ros.apply import StageMap, load
-from selfcal_ros.cli.terminal import add_json
-from selfcal_ros.cli.trace import deliver, outputs_of
+from selfcal_ros.cli.deliver import deliver
+from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import csv_cells, read_text
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
     """
-    check_outputs([args.result, args.points], outputs_of(args))
+    check_outputs([args.result, args.points], [file_of(args)])
     stage = load(args.result, method=args.method, outside=args.outside)
     points = read_points(read_text(args.points), args.points)
     if points.shape[1] == len(ENDS):

@@ -23,8 +23,8 @@ from selfcal_ros.aerotech.verify import (
 )
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli import cal_lines
+from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
-from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
@@ -213,7 +213,7 @@ def _export(args: argparse.Namespace) -> int:
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=export.theta_decimals(result.error_map))
     lines, files = [], []
-    for path, backup in replace_files(args, texts, [args.result, args.onto], result).items():
+    for path, backup in replace_files(args, texts, [args.result, args.onto]).items():
         kind = "1D table for theta" if path != args.output else "2D table for x and y"
         lines.append(f"{path}: {kind}{replaced(backup)}")
         files.append({"file": path, "kind": kind, "old_file": backup})

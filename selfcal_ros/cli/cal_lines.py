@@ -20,8 +20,8 @@ from selfcal_ros.aerotech import export as cal_lines
 from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
 from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
 from selfcal_ros.aerotech.write import cal_text
+from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
-from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
@@ -278,7 +278,7 @@ def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFr
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
-        backup = replace_files(args, {args.output: text}, [args.source], result)[args.output]
+        backup = replace_files(args, {args.output: text}, [args.source])[args.output]
         say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
             found | {"file": args.output, "old_file": backup})
     else:

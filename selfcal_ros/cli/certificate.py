@@ -3,8 +3,8 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import add_json
-from selfcal_ros.cli.trace import deliver, outputs_of
+from selfcal_ros.cli.deliver import deliver
+from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
 from selfcal_ros.standards.dcc import certificate
@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read result and details, write the certificate."""
-    check_outputs([args.result, args.details], outputs_of(args))
+    check_outputs([args.result, args.details], [file_of(args)])
     result = read_result(args.result)
     details = read_details(args.details)
     xml = certificate(result, details, covariance=args.covariance,

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put
-from selfcal_ros.cli.trace import traced
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.external import map_from_table
@@ -63,16 +62,8 @@ def read_parts(names: Sequence[str]) -> list[Part]:
                          "the sites of the mean")
     artifact = next(iter(results.values())).artifact
     return [Part(name, results[name].error_map, results[name]) if name in results else
-            Part(name, map_from_table(read_text(name), name, artifact), source=_source(name))
+            Part(name, map_from_table(read_text(name), name, artifact))
             for name in names]
-
-
-def _source(name: str) -> CalibrationResult | None:
-    """Return the result that a table is of, if it and its record are as `selfcal table` wrote."""
-    try:
-        return read_result(traced(name, None)[0][2])
-    except InputError:
-        return None
 
 
 def _text(result: CalibrationResult, found: dict[str, Any]) -> str:

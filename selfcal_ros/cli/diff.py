@@ -19,12 +19,12 @@ from selfcal_ros.estimation.comparison.maps import (
     compare_with_laser,
 )
 from selfcal_ros.estimation.comparison.together import plate_as_map
-from selfcal_ros.files import parse_json
+from selfcal_ros.files import read_json
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.figures.maps import difference_picture
 from selfcal_ros.reporting.summary.sections import enlargement_texts
-from selfcal_ros.results import read_result, result_bytes
+from selfcal_ros.results import read_result
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 
 
@@ -45,8 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
     check_outputs([args.a, args.b], [args.plot])
-    a, (name, raw) = read_result(args.a), result_bytes(args.b)
-    second = parse_json(raw, name)
+    a, second = read_result(args.a), read_json(args.b)
     if isinstance(second, dict) and "ex_x" in second:
         if args.keep_scale:
             raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "

@@ -5,8 +5,8 @@ import argparse
 
 from selfcal_ros.cli.cal import figures_of, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
+from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say
-from selfcal_ros.cli.trace import command, replace_files, replaced
 from selfcal_ros.controllers.export import FORMATS, export, loaded
 from selfcal_ros.controllers.grid import Source, Wiring
 from selfcal_ros.errors import InputError
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     exported = export(args.format, result, wiring, args.output, active=active, filled=filled,
                   command=command(args))
     say_bent(args, exported.bent_m)
-    backups = replace_files(args, exported.files, [args.result, *(args.onto or ())], result)
+    backups = replace_files(args, exported.files, [args.result, *(args.onto or ())])
     lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:
         lines.append(residual_text(exported.residuals))

@@ -9,8 +9,8 @@ import numpy as np
 
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.terminal import add_json
-from selfcal_ros.cli.trace import command, deliver, outputs_of
+from selfcal_ros.cli.deliver import command, deliver
+from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
 from selfcal_ros.controllers.gcode_codes import DIALECTS, PRINTERS
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--unit", f"programs for {args.dialect} are in mm", "leave it out")
     unit, args.unit = args.unit, args.unit or "mm"
     frame = replace(frame_of(args), unit="m")
-    check_outputs([args.program, args.result], outputs_of(args))
+    check_outputs([args.program, args.result], [file_of(args)])
     result, filled = ready(args)
     plate = result.artifact
     rewriter = Rewriter(

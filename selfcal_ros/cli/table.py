@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from selfcal_ros.cli.terminal import STDOUT, add_json
-from selfcal_ros.cli.trace import deliver, outputs_of
+from selfcal_ros.cli.deliver import deliver
+from selfcal_ros.cli.terminal import STDOUT, add_json, file_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     if kind not in KINDS:
         raise InputError(args.output, "its suffix is not that of a table",
                          "name a file that ends in " + " or ".join(KINDS) + ", or - for stdout")
-    check_outputs([args.result], outputs_of(args))
+    check_outputs([args.result], [file_of(args)])
     result = read_result(args.result)
     content = csv_bytes(result) if kind == ".csv" else npz_bytes(result)
     return deliver(args, result, content, "csv", kind=kind.lstrip("."))

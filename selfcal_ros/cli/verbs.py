@@ -59,8 +59,6 @@ VERBS = {
     "iso230": Verb(CERTIFY, "figures of ISO 230: accuracy, circularity, diagonals"),
     "plan": Verb(CHECK, "check a plan before it is measured, or suggest views"),
     "simulate": Verb(CHECK, "write a bag of a simulated cell, with its known truth"),
-    "embed": Verb(MORE, "keep result, plan and exports in the bag, as attachments"),
-    "trace": Verb(MORE, "show which result a table was exported from"),
     "step-diagonal": Verb(MORE, "axis errors from a laser step-diagonal measurement"),
     "reproduce": Verb(MORE, "repeat the published simulations of Hu or Qiao")}
 """Verbs; `step-diagonal` is the module ``step_diagonal.py`` of this package."""
@@ -102,8 +100,6 @@ EXAMPLES = {
     "plan check": "selfcal plan check config/plans/hu.yaml --sigma 20nm",
     "plan suggest": "selfcal plan suggest config/plans/hu.yaml",
     "simulate": "selfcal simulate config/simulations/general.yaml -o simulated",
-    "embed": "selfcal embed BAG RESULT.json",
-    "trace": "selfcal trace map.csv",
     "step-diagonal": "selfcal step-diagonal config/step_diagonal/case_study.csv --method new",
     "reproduce": "selfcal reproduce hu --draws 20"}
 """Verb, with its second word if it has one -> a command for its help."""

@@ -272,7 +272,6 @@ RUNS = {
     "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
     "table": "table S -o t.csv", "combine": "combine S u.csv -o mean.json",
     "certificate": "certificate S DETAILS -o c.xml", "iso230": "iso230 S",
-    "embed": "embed BAG", "trace": "trace t.csv",
     "plan check": "plan check PLAN",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",

@@ -70,7 +70,7 @@ def test_its_map_is_exported_drawn_and_certified_as_any_other(said):
     for words in (["table", "one.json", "-o", "map.csv"], ["plot", "one.json", "-o", "map.svg"],
                   ["export", "kmotion", "one.json", "-o", "k.txt"], ["report", "one.json", "-o",
                   "r.html"], ["cal", "export", "one.json", "-o", "a.cal"],
-                  ["embed", "two", "two.json"], ["iso230", "one"],
+                  ["iso230", "one"],
                   ["certificate", "one.json", simulated_details(Path.cwd()), "-o", "c.xml"],
                   ["batch", "one", "two", "-o", "many"]):
         said(*words)

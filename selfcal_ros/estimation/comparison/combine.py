@@ -143,17 +143,19 @@ def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
 
 def _require_single_run(part: Part, others: Sequence[Part]) -> None:
     """Refuse a map that is not of one recording alone, or of that of another map."""
-    result = part.origin
+    result = part.result
     if result is None:
         return
     if result.method == COMBINED:
         raise InputError(part.name, "a mean of several runs", "name these runs themselves")
     for other in others:
-        if other.origin is not None and _same_recording(result, other.origin):
+        if other.result is None:
+            continue
+        if _same_recording(result, other.result):
             raise InputError(part.name, f"of the same recording as {other.name}",
                              "leave one of them out")
-        if other.origin is not None and (plate := _readings_of_plate(result)) and (
-                plate == _readings_of_plate(other.origin)):
+        plate = _readings_of_plate(result)
+        if plate and plate == _readings_of_plate(other.result):
             raise InputError(part.name, f"of the same plate errors as {other.name}: both rest on "
                              "one calibration", "leave one of them out")
 

@@ -27,20 +27,11 @@ OTHER_UNIT = 300.0
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A map to be combined: its file, and its calibration; None for a map of other origin.
-
-    `source` is the calibration behind it, also if the map itself was read from a table.
-    """
+    """A map to be combined: its file, and its calibration; None for a map of other origin."""
 
     name: str
     error_map: ErrorMap
     result: CalibrationResult | None = None
-    source: CalibrationResult | None = None
-
-    @property
-    def origin(self) -> CalibrationResult | None:
-        """The calibration behind the map, if it is known."""
-        return self.result or self.source
 
 
 def require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.ndarray) -> None:

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deliver an export: to stdout or to files, of which old ones are kept; with its exit code."""
+
+import argparse
+import shlex
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from selfcal_ros.aerotech.write import refuse_existing, write_cal
+from selfcal_ros.cli.terminal import STDOUT, exit_code, say
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.outputs import check_outputs, write_bytes
+
+
+def deliver(args: argparse.Namespace, result: CalibrationResult, content: str | bytes, key: str, *,
+            note: str = "", **data: Any) -> int:
+    """Write an export of a result to its file or to stdout; return the exit code.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Arguments with ``output``.
+    result : CalibrationResult
+        The result; if it is not qualified, the code is 5 and the reason on stderr.
+    content : str or bytes
+        Content of the file.
+    key : str
+        Key of the content in the JSON of ``--json``, if it goes to stdout.
+    note : str
+        Follows the name of the file that was written.
+    **data
+        More JSON on the file.
+    """
+    raw = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+    if args.output == STDOUT:
+        text = raw.decode()
+        say(args, text.removesuffix("\n"), {key: text})
+    else:
+        write_bytes(args.output, raw)
+        say(args, f"written: {args.output}{note}", {"written": args.output, **data})
+    return exit_code(result)
+
+
+def replace_files(args: argparse.Namespace, texts: Mapping[str, str],
+                  sources: Iterable[str | None]) -> dict[str, str | None]:
+    """Write files, keep those that they replace; return path -> the old one.
+
+    Raises
+    ------
+    InputError
+        If one of them is a source, cannot be written, or exists and ``--force`` is not given.
+    """
+    check_outputs(sources, texts)
+    refuse_existing(list(texts), force=args.force)
+    backups = {path: write_cal(path, text, force=args.force) for path, text in texts.items()}
+    return {path: str(backup) if backup else None for path, backup in backups.items()}
+
+
+def replaced(backup: str | None) -> str:
+    """Return a note on the old file, empty if there was none."""
+    return f"; the old file is {backup}" if backup else ""
+
+
+def command(args: argparse.Namespace) -> str:
+    """Return the command line."""
+    return shlex.join(["selfcal", *args.words])
