@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 
 from selfcal_ros.files import parse_json, read_bytes
-from selfcal_ros.model.result import CalibrationResult, result_from_dict
+from selfcal_ros.model.result import CalibrationResult, require_unchanged, result_from_dict
 
 
 def read_result(path: str | os.PathLike, limit: int | None = None) -> CalibrationResult:
@@ -22,8 +22,10 @@ def read_result(path: str | os.PathLike, limit: int | None = None) -> Calibratio
     Raises
     ------
     InputError
-        If it is not a result.
+        If it is not a result, or was changed after it was written.
     """
-    raw = read_bytes(path, limit)
-    result = result_from_dict(parse_json(raw, path, limit), str(path))
-    return replace(result, read_from=(str(path), hashlib.sha256(raw).hexdigest()))
+    raw, where = read_bytes(path, limit), str(path)
+    data = parse_json(raw, path, limit)
+    result = result_from_dict(data, where)
+    require_unchanged(data, where)
+    return replace(result, read_from=(where, hashlib.sha256(raw).hexdigest()))

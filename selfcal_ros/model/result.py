@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a calibration and its JSON form, schema ``selfcal.result/1``."""
 
+import hashlib
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -39,6 +41,8 @@ from selfcal_ros.model.verdict import (
 from selfcal_ros.outputs import plain
 
 SCHEMA = "selfcal.result/1"
+DIGEST = "digest"
+"""Key of the digests of the other keys."""
 COMBINED = "combined"
 """Method of a mean of several results, and key of the runs behind it."""
 LARGEST = 1e3
@@ -256,6 +260,8 @@ def unidentified_result(measurements: Measurements, observability: Observability
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
     """Return the JSON form of a result; NaN becomes null.
 
+    Its last key, ``digest``, is that of `digests_of`.
+
     Raises
     ------
     ValueError
@@ -263,7 +269,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
     """
     emap, amap, artifact = result.error_map, result.artifact_map, result.plate
     provenance = result.provenance
-    return {
+    data = {
         "schema": SCHEMA,
         "plan_id": result.plan_id,
         "method": result.method,
@@ -302,6 +308,42 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
+    return {**data, DIGEST: digests_of(data)}
+
+
+def digests_of(data: dict[str, Any]) -> dict[str, str]:
+    """Return the digest of each key of a JSON form: the first 64 bits of the SHA-256 of its value.
+
+    The time of creation counts for nothing: a solution of the same readings has the same digests.
+    """
+    provenance = dict(data.get("provenance") or {})
+    provenance.pop("created", None)
+    found = {}
+    for key, value in {**data, "provenance": provenance}.items():
+        text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+        found[key] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    found.pop(DIGEST, None)
+    return found
+
+
+def require_unchanged(data: dict[str, Any], where: str) -> None:
+    """Refuse a JSON form that was changed after it was written; one without digests is accepted.
+
+    Raises
+    ------
+    InputError
+        If a key does not have its digest; the message names the key.
+    """
+    written = data.get(DIGEST)
+    if written is None:
+        return
+    now = digests_of(data)
+    if not isinstance(written, dict):
+        written = {}
+    for key in (*now, *written):
+        if now.get(key) != written.get(key):
+            raise InputError(where, f"its {key!r} was changed after the file was written",
+                             "write it again with the verb that made it, such as `selfcal solve`")
 
 
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
@@ -309,7 +351,7 @@ _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "excluded", "input", "map"}
+          "budget", "excluded", "input", "map", DIGEST}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:

@@ -29,8 +29,9 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 from selfcal_ros.model.view import View
-from selfcal_ros.outputs import plain
+from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.results import read_result
 from test.support.results import known_result
 
 ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
@@ -193,3 +194,44 @@ def test_a_verdict_of_before_has_the_grade_of_its_qualification():
     data["verdict"]["grade"] = "enlarged"
     with pytest.raises(InputError, match="the grade 'enlarged' contradicts qualified False"):
         result_from_dict(data, "old")
+
+
+def written_file(folder):
+    path = folder / "r.json"
+    write_json(path, result_to_dict(known_result(5, 8)[0]))
+    return path
+
+
+def edited(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(("key", "change"), [
+    ("error_map", lambda data: data["error_map"]["gx"][2].__setitem__(2, 1e-3)),
+    ("artifact", lambda data: data["artifact"].__setitem__("grid_pitch", 0.011)),
+    ("verdict", lambda data: data["verdict"].__setitem__("sentence", "Good")),
+    ("provenance", lambda data: data["provenance"].__setitem__("version", "0")),
+    ("remark", lambda data: data.__setitem__("remark", "better now")),
+    ("budget", lambda data: data["digest"].pop("budget"))])
+def test_a_file_that_was_edited_is_refused_with_the_key(key, change, tmp_path):
+    path = written_file(tmp_path)
+    edited(path, change)
+    with pytest.raises(InputError, match=f"r.json: its '{key}' was changed after the file was"):
+        read_result(path)
+
+
+def test_layout_and_time_of_creation_are_no_edits(tmp_path):
+    path = written_file(tmp_path)
+    before = read_result(path)
+    edited(path, lambda data: data["provenance"].__setitem__("created", "2026-01-02T03:04:05+00:00"))
+    assert_same(read_result(path), before)
+
+
+def test_a_file_without_digests_is_read(tmp_path):
+    """It comes from an older version, or from another program."""
+    path = written_file(tmp_path)
+    before = read_result(path)
+    edited(path, lambda data: data.pop("digest"))
+    assert_same(read_result(path), before)
