@@ -200,24 +200,46 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
 
 
 def read_text(path: str | os.PathLike, limit: int | None = None) -> str:
-    """Return the UTF-8 text of `path`; InputError names the byte that is not UTF-8."""
+    """Return the UTF-8 text of `path`; InputError names the byte that is not UTF-8.
+
+    A byte order mark, with which Excel and Windows begin a file, is left out.
+    """
     return _decoded(read_bytes(path, limit), path)
 
 
 def _decoded(raw: bytes, path: str | os.PathLike) -> str:
     try:
-        return raw.decode()
+        return raw.decode().removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start}", "not UTF-8 text",
                          "save the file as UTF-8") from error
 
 
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+
+
 def csv_cells(line: str, where: str) -> list[str]:
-    """Return the cells of a line of a table; InputError if invalid."""
+    """Return the cells of a line of a table.
+
+    Raises
+    ------
+    InputError
+        If the line is not one of a table, its columns are separated by semicolons or tabs, or a
+        number has a decimal comma.
+    """
     try:
-        return [cell.strip() for cell in next(csv.reader([line]))]
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
         raise InputError(where, f"not a line of a table ({error})", "correct the line") from error
+    remedy = "save the table with commas between columns and points in numbers"
+    for sign, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(cells) == 1 and sign in cells[0]:
+            raise InputError(where, f"columns are separated by {name} (and the numbers "
+                             "have decimal commas?)", remedy)
+    for cell in cells:
+        if DECIMAL_COMMA.fullmatch(cell):
+            raise InputError(where, f"'{cell}' has a decimal comma", remedy)
+    return cells
 
 
 def read_json(path: str | os.PathLike, limit: int | None = None) -> Any:

@@ -76,7 +76,7 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     NoDataError
         If there are no rows.
     """
-    text = read_text(path).removeprefix("\ufeff")  # spreadsheets begin with it
+    text = read_text(path)
     lines = [(f"{path}:{number}", line) for number, line in enumerate(
         text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     heading = csv_cells(lines[0][1], lines[0][0]) if lines else []

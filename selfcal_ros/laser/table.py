@@ -97,14 +97,11 @@ def dimension_of(path: str | os.PathLike) -> int:
 
 
 def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
-    lines = read_text(path).removeprefix("\ufeff").splitlines()
+    lines = read_text(path).splitlines()
     kept = [(number, line) for number, line in enumerate(lines, 1)
             if line.strip() and not line.lstrip().startswith("#")]
     if not kept:
         raise NoDataError(str(path), "the table is empty", "give a header and one row per block")
-    if ";" in kept[0][1] and "," not in kept[0][1]:
-        raise InputError(f"{path}:{kept[0][0]}", "columns are separated by semicolons",
-                         "separate them by commas, with a point in decimals")
     rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in kept]
     if len(rows) == 1:
         raise NoDataError(str(path), "the table has a header only", "give one row per block")
