@@ -11,7 +11,7 @@ import os
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.compensation.cells import Interpolation, Outside
+from selfcal_ros.compensation.cells import SNAP, Interpolation, Outside, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
@@ -58,22 +58,26 @@ class StageMap(Compensator):
     def covariance(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return the covariance of Gx at all points, then Gy at all points, (2P, 2P), m^2.
 
-        That of the bilinear interpolation at true positions; outside the field, that of the nearest
-        point of its edge. The variance of any combination a . (Gx, Gy), such as the distance of
+        That of the interpolated error at true positions, by the interpolation of the stage: its
+        values are linear in those of the sites. The variance of any combination a . (Gx, Gy), such as the distance of
         two points, is a' C a. The error of interpolation between the sites, as in `uncertainty`, is
         common to the points of a cell and independent between cells and between x and y.
 
         Raises
         ------
         InputError
-            For more than `MAX_POINTS` points, a point that needs an unknown site, or a result that
-            does not contain the correlations of its sites.
+            For more than `MAX_POINTS` points, a point outside the field or one that needs an
+            unknown site, or a result that does not contain the correlations of its sites.
         """
-        self._refuse_outside(x_m, y_m)
         x, y = (np.ravel(p) for p in np.broadcast_arrays(np.asarray(x_m, dtype=float),
                                                          np.asarray(y_m, dtype=float)))
         if len(x) > MAX_POINTS:
             raise InputError("covariance", f"{len(x)} points", f"give at most {MAX_POINTS}")
+        if np.isnan(x + y).any():
+            raise InputError("covariance", "a position is not a number", "give numbers")
+        if not self.inside(x, y).all():
+            raise InputError("covariance", "a point lies outside the calibrated field",
+                             "leave it out: its uncertainty is not known")
         weights = self._weights(x, y)
         used = weights.any(axis=0)
         if not self.error_map.valid.ravel()[used].all():
@@ -102,6 +106,8 @@ class StageMap(Compensator):
                      second: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
         """Return the error indicated - true of distances, and its standard uncertainty, (P,) m.
 
+        The uncertainty is NaN where an end lies outside the field.
+
         Parameters
         ----------
         first, second : tuple of array
@@ -119,9 +125,10 @@ class StageMap(Compensator):
         if not (length > 0).all():
             raise InputError("distance", "its ends coincide", "give two points")
         (ax, ay), (bx, by) = self.error(x1, y1), self.error(x2, y2)
-        u = np.empty(len(length))
-        for start in range(0, len(length), MAX_POINTS // 2):
-            part = slice(start, start + MAX_POINTS // 2)
+        u = np.full(len(length), np.nan)
+        known = np.flatnonzero(self.inside(x1, y1) & self.inside(x2, y2))
+        for start in range(0, len(known), MAX_POINTS // 2):
+            part = known[start:start + MAX_POINTS // 2]
             cover = self.covariance(np.append(x1[part], x2[part]), np.append(y1[part], y2[part]))
             u[part] = _along(cover, dx[part] / length[part], dy[part] / length[part])
         return np.hypot(dx + bx - ax, dy + by - ay) - length, u
@@ -129,14 +136,15 @@ class StageMap(Compensator):
     def length_uncertainty(self, *, anywhere: bool = True) -> tuple[float, float]:
         """Return a in m and b in m/m: U of a distance L in the field is at most a + b L.
 
-        With the coverage factor of the map, 95.45 %. Larger fields are judged at every second,
-        third, ... node.
+        With the coverage factor of the map, 95.45 %. Of a larger field every second, third, ...
+        node stands for its neighbours; of a bicubic map also points halfway between nodes, since
+        in the outermost cells its uncertainty is larger than at the nodes.
 
         Parameters
         ----------
         anywhere : bool
-            Whether the ends lie anywhere in the field: each halfway between nodes along x and y,
-            where the error of interpolation is largest. Otherwise both are nodes.
+            Whether the ends lie anywhere in the field, with the error of interpolation halfway
+            between nodes along x and y, where it is largest. Otherwise both are nodes.
 
         Raises
         ------
@@ -145,12 +153,7 @@ class StageMap(Compensator):
         """
         from scipy.optimize import linprog  # a third of a second, for this alone
 
-        plate = self.error_map.artifact
-        step = -(-max(plate.shape) // MOST_NODES)
-        some = np.zeros(plate.shape, dtype=bool)
-        some[::step, ::step] = True
-        some &= self.error_map.valid
-        x, y = plate.x_m[some], plate.y_m[some]
+        x, y = self._places(between=anywhere and self.method == "bicubic")
         i, j = np.triu_indices(len(x), 1)
         if not len(i):
             raise InputError("distance", "fewer than two sites are known", "measure more")
@@ -170,23 +173,44 @@ class StageMap(Compensator):
             [np.ones(len(U)), length / length.max()], axis=1))
         return float(found.x[0] * size), float(found.x[1] * size / length.max())
 
+    def _places(self, *, between: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return x and y of at most about `MOST_NODES` known nodes along a side, m, (P,).
+
+        With `between`, of points halfway between them too.
+        """
+        plate = self.error_map.artifact
+        if not between:
+            step = -(-max(plate.shape) // MOST_NODES)
+            some = np.zeros(plate.shape, dtype=bool)
+            some[::step, ::step] = True
+            some &= self.error_map.valid
+            return plate.x_m[some], plate.y_m[some]
+        sides = []
+        for count in plate.shape:
+            last = 2 * count - 2  # in half pitches
+            step = -(-last // MOST_NODES) | 1  # odd: nodes and points between them in turn
+            halves = np.unique([*range(0, last, step), 1, last - 1, last])
+            sides.append((halves - last / 2) * self._pitch / 2)
+        x, y = np.meshgrid(*sides, indexing="ij")
+        return x.ravel(), y.ravel()
+
     def _weights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the bilinear weights of the sites at points, (P, sites)."""
-        out = np.zeros((len(x), *self.error_map.artifact.shape))
-        places = []
-        for p, count in zip((x, y), out.shape[1:], strict=True):
-            s = np.clip(p / self._pitch + (count - 1) / 2, 0, count - 1)
-            if np.isnan(s).any():
-                raise InputError("covariance", "a position is not a number", "give numbers")
-            s = np.where(np.abs(s - np.round(s)) < 1e-9, np.round(s), s)
-            i = np.minimum(s.astype(int), count - 2)
-            places.append((i, s - i))
-        (i, u), (j, v) = places
-        row = np.arange(len(x))
-        for a, wx in ((0, 1 - u), (1, u)):
-            for b, wy in ((0, 1 - v), (1, v)):
-                out[row, i + a, j + b] += wx * wy
-        return out.reshape(len(x), -1)
+        """Return the weights of the sites in the interpolated error at points, (P, sites)."""
+        of_x, of_y = (self._weights_along(p, count) for p, count in zip(
+            (x, y), self.error_map.artifact.shape, strict=True))
+        return (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
+
+    def _weights_along(self, p_m: np.ndarray, count: int) -> np.ndarray:
+        """Return the weights of the nodes of one axis at positions along it, (P, count)."""
+        at = np.clip(p_m / self._pitch + (count - 1) / 2, 0, count - 1)
+        at = np.where(np.abs(at - np.round(at)) < SNAP, np.round(at), at)
+        below = np.minimum(at.astype(int), count - 2)
+        inside = (at - below)[:, None]
+        if self.method == "bicubic":  # the splines that are 1 at one node and 0 at the others
+            c = cubic_pieces(np.eye(count))[:, below]
+            return ((c[3] * inside + c[2]) * inside + c[1]) * inside + c[0]
+        unit = np.eye(count)
+        return (1 - inside) * unit[below] + inside * unit[below + 1]
 
 
 def _along(cover: np.ndarray, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:
@@ -204,7 +228,7 @@ def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarra
 
 def load(path: str | os.PathLike, *, method: Interpolation | None = None,
          outside: Outside = "clamp") -> StageMap:
-    """Return the calibrated stage of a RESULT.json, or of a bag with an embedded one.
+    """Return the calibrated stage of a RESULT.json.
 
     Raises
     ------

@@ -10,12 +10,14 @@ from selfcal_ros.apply import StageMap, load
 from selfcal_ros.cli.deliver import deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.compensator import Compensator
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import csv_cells, read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.outputs import check_outputs
-from selfcal_ros.units import UM_PER_M
+from selfcal_ros.units import MM_PER_M, UM_PER_M
 
+FAR = 10.0
+"""Half fields beyond which positions are in another unit."""
 AXES = ("x", "y", "theta")
 ENDS = ("x1", "y1", "x2", "y2")
 
@@ -34,34 +36,64 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", choices=("bilinear", "bicubic"),
                         help="interpolation between the nodes (default: that of the map; "
                              "bilinear on the plate's lattice, or if nodes are unknown)")
-    parser.add_argument("--outside", choices=("clamp", "refuse"), default="clamp",
-                        help="outside the field: use the error at its edge, or refuse (default "
-                             "clamp)")
+    parser.add_argument("--outside", choices=("empty", "edge", "refuse"), default="empty",
+                        help="points outside the field, where u is not known: leave them empty "
+                             "and end with code 5 (default), use the error at the edge of the "
+                             "field, or refuse")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Read result and points, write the corrected points.
 
-    A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`.
+    A result that is not qualified ends with code 5 and the reason on stderr, as in `solve`; so
+    do points outside the field that are left empty.
     """
     check_outputs([args.result, args.points], [file_of(args)])
-    stage = load(args.result, method=args.method, outside=args.outside)
+    stage = load(args.result, method=args.method,
+                 outside="refuse" if args.outside == "refuse" else "clamp")
     points = read_points(read_text(args.points), args.points)
-    if points.shape[1] == len(ENDS):
-        text, unknown, outside = distances(stage, points, inverse=args.inverse)
-    else:
-        text, unknown, outside = corrected(stage, points, inverse=args.inverse)
+    edge = args.outside == "edge"
+    refuse_other_unit(stage, points, args.points, edge=edge)
+    table = distances if points.shape[1] == len(ENDS) else corrected
+    text, unknown, outside = table(stage, points, inverse=args.inverse, edge=edge)
     _say_better(stage, points)
-    for count, what in ((outside, "outside the field, corrected as the nearest point of its edge"),
+    left = ("corrected as the nearest point of its edge, where u is not known" if edge else
+            "left empty (--outside edge corrects them as the nearest point of its edge)")
+    for count, what in ((outside, f"outside the field, {left}"),
                         (unknown, "next to unknown sites or lines, left empty")):
         if count:
             print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
-    return deliver(args, stage.result, text, "csv", note=f", {len(points)} points",
+    code = deliver(args, stage.result, text, "csv", note=f", {len(points)} points",
                    points=len(points), unknown=unknown, outside=outside)
+    return int(ExitCode.NOT_QUALIFIED) if outside and not edge else code
 
 
-def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
+def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str, *, edge: bool) -> None:
+    """Refuse points that all lie outside the field; with `edge` only those that lie far outside.
+
+    The origin is in the field in any unit.
+
+    Raises
+    ------
+    InputError
+        With the field, and the question whether the points are in mm.
+    """
+    places = points.reshape(-1, 2) if points.shape[1] == len(ENDS) else points[:, :2]
+    places = places[places.any(axis=1)]
+    plate = stage.error_map.artifact
+    half = np.array(plate.half) * plate.grid_pitch_m
+    beyond = (np.abs(places) / half).max(axis=1, initial=0.0)
+    if not len(places) or stage.inside(*places.T).any() or (edge and beyond.max() <= FAR):
+        return
+    x, y = half * MM_PER_M
+    farthest = places[beyond.argmax()]
+    raise InputError(where, f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from "
+                     f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in "
+                     "mm?", "give positions in m, in the stage frame")
+
+
+def _say_better(stage: StageMap, points: np.ndarray) -> None:
     """Recommend bicubic interpolation if it at least halves u between the nodes."""
     emap, used = stage.error_map, rms(stage.halfway)
     x, y = points[:, :2].T
@@ -76,7 +108,7 @@ def _say_better(stage: "StageMap", points: "np.ndarray") -> None:
               file=sys.stderr)
 
 
-def read_points(text: str, where: str) -> "np.ndarray":
+def read_points(text: str, where: str) -> np.ndarray:
     """Return the points of a table x,y[,theta] or x1,y1,x2,y2, (P, 2 to 4).
 
     Raises
@@ -104,36 +136,49 @@ def read_points(text: str, where: str) -> "np.ndarray":
     return points
 
 
-def corrected(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
-    """Return the table of corrected points, and how many are unknown and outside the field."""
+def corrected(stage: StageMap, points: np.ndarray, *, inverse: bool,
+              edge: bool) -> tuple[str, int, int]:
+    """Return the table of corrected points, and how many are unknown and outside the field.
+
+    Those outside are left empty, or with `edge` corrected as the nearest point of the field.
+    """
     names, what = AXES[:points.shape[1]], "true" if inverse else "command"
     x, y, *theta = points.T
     found = list(stage.correct(x, y) if inverse else stage.command(x, y))
-    at = found if inverse else [x, y]  # u is that of the map at the true position
-    u = list(stage.uncertainty(at[0], at[1]))
+    u = list((stage.uncertainty_indicated if inverse else stage.uncertainty)(x, y))
+    outside = ~stage.inside(x, y)
+    if inverse:
+        outside &= ~stage.inside(found[0], found[1])
     if theta:
         found.append((stage.correct_theta if inverse else stage.command_theta)(theta[0]))
         u.append(stage.uncertainty_theta(found[2] if inverse else theta[0]))
-    rows = np.column_stack([points, *found, *u])
+    unknown = int((np.isnan(found).any(axis=0) & ~outside).sum())
+    if not edge:
+        found[:2] = (np.where(outside, np.nan, axis) for axis in found[:2])
     head = [*names, *(f"{name}_{what}" for name in names), *(f"u_{name}" for name in names)]
-    lines = [",".join("" if cell != cell else repr(cell) for cell in row) for row in rows.tolist()]
-    unknown = int(np.isnan(found).any(axis=0).sum())
-    return "\n".join([",".join(head), *lines]) + "\n", unknown, int((~stage.inside(x, y)).sum())
+    return _csv(head, np.column_stack([points, *found, *u])), unknown, int(outside.sum())
 
 
-def distances(stage: "StageMap", points: "np.ndarray", *, inverse: bool) -> tuple[str, int, int]:
+def distances(stage: StageMap, points: np.ndarray, *, inverse: bool,
+              edge: bool) -> tuple[str, int, int]:
     """Return the table of distances with their errors, as `corrected`; and a line over length."""
     if inverse:
         raise InputError("--inverse", "the ends of distances are true positions", "leave it out")
     x1, y1, x2, y2 = points.T
     error, u = stage.length_error((x1, y1), (x2, y2))
-    rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u]).tolist()
+    outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
+    if not edge:
+        error = np.where(outside, np.nan, error)
     for where, anywhere in (("anywhere in the field", True), ("of two nodes", False)):
         a, b = stage.length_uncertainty(anywhere=anywhere)
         print(f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} um + "
               f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
               file=sys.stderr)
-    outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
-    lines = [",".join(map(repr, row)) for row in rows]
-    return ("\n".join([",".join([*ENDS, "length", "error", "u"]), *lines]) + "\n", 0,
-            int(outside.sum()))
+    rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
+    return _csv([*ENDS, "length", "error", "u"], rows), 0, int(outside.sum())
+
+
+def _csv(head: list[str], rows: np.ndarray) -> str:
+    """Return a table; what is not known is empty."""
+    lines = [",".join("" if cell != cell else repr(cell) for cell in row) for row in rows.tolist()]
+    return "\n".join([",".join(head), *lines]) + "\n"

@@ -48,7 +48,8 @@ class Compensator:
         refuses a map with unknown sites, because each of them would affect the whole field. An
         angular map with harmonics is its Fourier series with both.
     outside : {"clamp", "refuse"}
-        Outside the calibrated field: use the error of the nearest point of its edge, or raise.
+        Outside the calibrated field: use the error of the nearest point of its edge, whose
+        uncertainty there is not known, or raise.
     fitted : {"bilinear", "bicubic"}, optional
         Interpolation with which the map was estimated, if it has nodes of its own: what it does not
         follow is then in the uncertainty of its nodes.
@@ -164,6 +165,8 @@ class Compensator:
     def uncertainty(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
 
+        NaN outside the field: no reading says anything about G there.
+
         The uncertainties of the sites, interpolated bilinearly: an upper bound for the bilinear
         value whatever the correlation of the sites. The bicubic value for sites with equal and
         independent errors stays within it to 1 %, except in the outermost cells, where it may
@@ -179,7 +182,27 @@ class Compensator:
         ux, uy = self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
                               self._u_cells.block)
         more_x, more_y = self._between(x_m, y_m)
-        return np.hypot(ux, more_x), np.hypot(uy, more_y)
+        inside = self.inside(x_m, y_m)
+        return (np.where(inside, np.hypot(ux, more_x), np.nan),
+                np.where(inside, np.hypot(uy, more_y), np.nan))
+
+    def uncertainty_indicated(self, x_m: ArrayLike, y_m: ArrayLike,
+                              ) -> tuple[np.ndarray, np.ndarray]:
+        """Return `uncertainty` at the true positions of indicated ones `x_m`, `y_m`.
+
+        What is indicated in the field belongs to it, also where its error places it just beyond
+        the edge: there it has the uncertainty of the edge.
+
+        Raises
+        ------
+        InputError
+            As `correct`.
+        """
+        indicated_inside, places = self.inside(x_m, y_m), []
+        for true, half in zip(self.correct(x_m, y_m), self.error_map.artifact.half, strict=True):
+            edge = half * self._pitch
+            places.append(np.where(indicated_inside, np.clip(true, -edge, edge), true))
+        return self.uncertainty(places[0], places[1])
 
     @cached_property
     def halfway(self) -> np.ndarray:

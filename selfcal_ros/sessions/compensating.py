@@ -260,8 +260,7 @@ class CompensatingSession:
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")
         found = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
-        at = found if inverse else points  # u belongs to the map at true positions
-        u = [*use.uncertainty(at[0], at[1]), points[2]]
+        u = [*(use.uncertainty_indicated if inverse else use.uncertainty)(*points[:2]), points[2]]
         if len(theta):
             found[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
             u[2] = use.uncertainty_theta(found[2] if inverse else points[2])

@@ -39,7 +39,8 @@ def table(path) -> tuple[list[str], np.ndarray]:
 
 @pytest.mark.parametrize("inverse", [False, True])
 def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
-    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", *["--inverse"] * inverse]) == 0
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "edge",
+                 *["--inverse"] * inverse]) == 0
     head, rows = table(desk / "o.csv")
     end = "true" if inverse else "command"
     assert head == ["x", "y", "theta", f"x_{end}", f"y_{end}", f"theta_{end}",
@@ -50,13 +51,15 @@ def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
     np.testing.assert_array_equal(rows[:, 3:5].T, wanted)
     turned = use.correct_theta(theta) if inverse else use.command_theta(theta)
     np.testing.assert_array_equal(rows[:, 5], turned)
-    at = wanted if inverse else (x, y)
+    at = np.clip(wanted, -0.02, 0.02) if inverse else np.array([x, y])
+    at[:, 2] = 0.05  # the point outside
     np.testing.assert_array_equal(rows[:, 6:8].T, use.uncertainty(*at))
     np.testing.assert_array_equal(rows[:, 8], use.uncertainty_theta(turned if inverse else theta))
     out, err = capsys.readouterr()
     assert out == "written: o.csv, 4 points\n"
     assert err.splitlines() == [
-        "selfcal apply: points outside the field, corrected as the nearest point of its edge: 1",
+        "selfcal apply: points outside the field, corrected as the nearest point of its edge, "
+        "where u is not known: 1",
         "selfcal apply: points next to unknown sites or lines, left empty: 1"]
 
 
@@ -72,7 +75,8 @@ def test_there_and_back_is_where_it_was(desk):
 
 def test_stdout_json_and_bicubic(desk, capsys):
     write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))
-    assert main(["apply", "R.json", "p.csv", "-o", "-", "--json", "--method", "bicubic"]) == 0
+    assert main(["apply", "R.json", "p.csv", "-o", "-", "--json", "--method", "bicubic",
+                 "--outside", "edge"]) == 0
     text = json.loads(capsys.readouterr().out)["csv"]
     (desk / "o.csv").write_text(text)
     use = Compensator(random_map(Artifact(5, 0.01, 8), 3), method="bicubic")
@@ -84,18 +88,19 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     result = worded(calibrate(collected(events_of(small_plan("0, 90, 180, tx")))[1]))
     write_json("R.json", result_to_dict(result))
     (desk / "d.csv").write_text("x1,y1,x2,y2\n-0.02,0,0.02,0.01\n0,0,0,0.05\n")
-    assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 0
+    assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 5
     head, rows = table(desk / "o.csv")
     assert head == ["x1", "y1", "x2", "y2", "length", "error", "u"]
     error, u = StageMap(result).length_error(*rows[:, :4].T.reshape(2, 2, 2))
-    np.testing.assert_array_equal(rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], error, u])
+    np.testing.assert_array_equal(
+        rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], [error[0], np.nan], [u[0], np.nan]])
     *lines, outside = capsys.readouterr().err.splitlines()
     for line, anywhere in zip(lines, (True, False), strict=True):
         a, b = StageMap(result).length_uncertainty(anywhere=anywhere)
         where = "anywhere in the field" if anywhere else "of two nodes"
         assert (f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
                 in line)
-    assert outside.endswith("nearest point of its edge: 1")
+    assert outside.startswith("selfcal apply: points outside the field, left empty (")
     assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--inverse"]) == 2
     assert "the ends of distances are true positions" in capsys.readouterr().err
 
@@ -115,13 +120,59 @@ def test_a_bad_table_is_one_line(desk, capsys, text, message):
     assert not (desk / "o.csv").exists()
 
 
+@pytest.mark.parametrize("inverse", [False, True])
+def test_beyond_the_edge_nothing_is_known(desk, capsys, inverse):
+    """Neither value nor u, and code 5; theta has no edge, and the edge itself is inside."""
+    (desk / "p.csv").write_text("x,y,theta\n0.02,0.02,0.5\n0.0225,0.0,1\n0.0,-0.03,1\n")
+    words = ["apply", "R.json", "p.csv", "-o", "o.csv", *["--inverse"] * inverse]
+    write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3, gain=1e-6))))
+    assert main(words) == 5
+    rows = table(desk / "o.csv")[1]
+    known = np.isfinite(rows[:, 3:])
+    np.testing.assert_array_equal(known, [[True] * 6, *[[False, False, True] * 2] * 2])
+    assert "left empty (--outside edge" in capsys.readouterr().err
+    assert main([*words, "--outside", "edge"]) == 0
+    edge = table(desk / "o.csv")[1]
+    np.testing.assert_array_equal(np.isfinite(edge[:, 3:6]), True)
+    np.testing.assert_array_equal(np.isfinite(edge[:, 6:]), known[:, 3:])
+
+
+@pytest.mark.parametrize(("text", "words", "code"), [
+    ("x,y\n10,-5\n0,0\n", (), 2), ("x,y\n10,-5\n0,0\n", ("--outside", "edge"), 2),
+    ("x1,y1,x2,y2\n10,-5,0,0\n", (), 2), ("x,y\n0.021,0\n0,0\n", (), 2),
+    ("x,y\n0.021,0\n0,0\n", ("--outside", "edge"), 0), ("x,y\n10,-5\n0.01,0\n", (), 5),
+    ("x,y\n0,0\n", (), 0)])
+def test_points_in_mm_are_asked_about(desk, capsys, text, words, code):
+    (desk / "p.csv").write_text(text)
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", *words]) == code
+    asked = ("p.csv: all points lie outside the field (x from -20 to 20 mm, y from -20 to 20 mm), "
+             "up to (")
+    assert (asked in (err := capsys.readouterr().err)) is (code == 2)
+    assert ("m: is it in mm?; give positions in m" in err) is (code == 2)
+
+
+def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys):
+    words = ["apply", "R.json", "p.csv", "-o", "o.csv"]
+    (desk / "p.csv").write_bytes(b"\xef\xbb\xbfx,y\r\n0.01,-0.005\r\n0,0\r\n,\r\n")
+    assert main(words) == 0
+    np.testing.assert_array_equal(table(desk / "o.csv")[1][:, :2], [[0.01, -0.005], [0, 0]])
+    for text, message in (
+            ("x;y\n0,01;-0,005\n", "p.csv:1: columns are separated by semicolons (and the numbers "
+             "have decimal commas?); save the table with commas between columns and points in"),
+            ("x\ty\n0.01\t0\n", "p.csv:1: columns are separated by tabs"),
+            ('x,y\n"0,01","-0,005"\n', "p.csv:2: '0,01' has a decimal comma; save the table")):
+        (desk / "p.csv").write_text(text)
+        assert main(words) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_outside_refused_and_not_qualified(desk, capsys):
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
     assert "outside the calibrated field" in capsys.readouterr().err
     doubt = replace(result_of(MAP), verdict=Verdict(
         Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))
     write_json("R.json", result_to_dict(doubt))
-    assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 5
+    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "edge"]) == 5
     assert "too noisy" in capsys.readouterr().err and (desk / "o.csv").exists()
 
 
