@@ -59,9 +59,10 @@ class StageMap(Compensator):
         """Return the covariance of Gx at all points, then Gy at all points, (2P, 2P), m^2.
 
         That of the interpolated error at true positions, by the interpolation of the stage: its
-        values are linear in those of the sites. The variance of any combination a . (Gx, Gy), such as the distance of
-        two points, is a' C a. The error of interpolation between the sites, as in `uncertainty`, is
-        common to the points of a cell and independent between cells and between x and y.
+        values are linear in those of the sites. The variance of any combination a . (Gx, Gy), such
+        as the distance of two points, is a' C a. The error of interpolation between the sites, as
+        in `uncertainty`, is common to the points of a cell and independent between cells and
+        between x and y.
 
         Raises
         ------

@@ -108,6 +108,8 @@ RESULT = {
     "rejected": "reason -> number of detections", "warnings": "a list of sentences",
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
                 "size, u, unit, p, details (by name, SI units)",
+    "digest": "key -> the first 64 bits of the SHA-256 of its value, without the time of creation: "
+              "a key that was edited is refused by name; a file without `digest` is accepted",
     "excluded": "effects outside U, as lines of `budget` with the source `excluded`: `u` is a "
                 "nominal size, `effect_rms`, `effect_max` what it would add to u of the XY map",
     "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "

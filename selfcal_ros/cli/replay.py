@@ -29,7 +29,7 @@ from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, Detect
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json, write_yaml
-from selfcal_ros.model.result import result_from_dict
+from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 
 AS_RECORDED = -1
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
                 print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
         if not saved.exists():
             return code or 1
-        data = with_bag(read_json(saved), bag, unplayed) | {"input": source}
+        data = with_bag(read_json(saved), bag, unplayed, source)
     if file_of(args):
         write_json(args.output, data)
     if on_stdout(args):
@@ -124,7 +124,8 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
                    max_marks=ANY_NUMBER, autostart=way.autostart)
 
 
-def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str]) -> dict[str, Any]:
+def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str],
+             source: dict[str, str]) -> dict[str, Any]:
     """Return the JSON form of a result with what the nodes could not see of the bag.
 
     No node can detect clock steps during fast replay, and messages stamped in the future were not
@@ -138,12 +139,15 @@ def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str]) -> dict[s
         Problems of the bag.
     unplayed : list of str
         What could not be played, one line each.
+    source : dict
+        File and SHA-256 of the bag.
     """
     beside = [line for line in unplayed if line not in (*bag.lost, *bag.clock)]
     known = [*bag.lost, *beside, *bag.clock]
     of_nodes = [line for line in data["warnings"] if line not in known]
-    return data | {"warnings": [*of_nodes, *known],
-                   "rejected": dict(sorted((data["rejected"] | bag.refused).items()))}
+    refused = dict(sorted((data["rejected"] | bag.refused).items()))
+    return with_digests(data | {"warnings": [*of_nodes, *known], "rejected": refused,
+                                "input": source})
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict,

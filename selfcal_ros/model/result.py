@@ -308,6 +308,12 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "input": dict(result.input),
         **{key: plain(value) for key, value in result.extra.items()},
     }
+    return with_digests(data)
+
+
+def with_digests(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a JSON form with the digests of its keys, last."""
+    data = {key: value for key, value in data.items() if key != DIGEST}
     return {**data, DIGEST: digests_of(data)}
 
 

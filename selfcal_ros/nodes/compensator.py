@@ -59,7 +59,7 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
     def _correct(self, request: Any, response: Any) -> str:
         answer = self.session.answer(request.x, request.y, request.theta, inverse=request.inverse)
         fill(response, answer)
-        return self.session.source
+        return self.session.remark(answer)
 
 
 def main() -> None:

@@ -48,11 +48,11 @@ class CompensatingSession:
         self._settings, self._ports = settings, ports
         self.compensator: Compensator | None = None
         self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0,
-                       "commands": 0, "commands_refused": 0}
+                       "commands": 0, "commands_refused": 0, "outside": 0}
         self._waiting: list[tuple[bytes, int]] = []
         self._editor = PositionEditor()
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
-        self._skipped = self._commands_refused = 0  # since then
+        self._skipped = self._commands_refused = self._outside = 0  # since then
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = ""
@@ -233,6 +233,9 @@ class CompensatingSession:
         try:
             if x is not None and y is not None:
                 corrected[x], corrected[y] = map(float, by[0](positions[x], positions[y]))
+                if not self.compensator.is_inside(positions[x], positions[y]):
+                    self.counts["outside"] += 1
+                    self._outside += 1
             if theta is not None and self.compensator.has_theta:
                 corrected[theta] = float(by[1](positions[theta]))
         except InputError:
@@ -269,10 +272,12 @@ class CompensatingSession:
                              "leave it out, or measure the site")
         return dict(zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*found, *u], strict=True))
 
-    @property
-    def source(self) -> str:
-        """The map in use, in words."""
-        return f"corrected by the map of {self._used}"
+    def remark(self, answer: dict[str, np.ndarray]) -> str:
+        """Return the line of an answer: the map that was used, and whether u is missing."""
+        unknown = int(np.isnan([answer["u_x"], answer["u_y"]]).any(axis=0).sum())
+        missing = f"; u is not known at {unknown} positions: is one outside the field, or has " \
+            "the map no uncertainties?" if unknown else ""
+        return f"corrected by the map of {self._used}{missing}"
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the node, and of its timing since the last call."""
@@ -291,6 +296,10 @@ class CompensatingSession:
             lines.append(f"{refused} commands refused since the last status and not passed on: no "
                          "map, no complete position, a joint named twice, or a position where the "
                          "map is unknown")
+        outside, self._outside = self._outside, 0
+        if outside:
+            lines.append(f"{outside} positions outside the field since the last status, corrected "
+                         "as at its edge: how well is not known")
         if oldest > limit:
             lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
                          f"published, max_age is {limit * MS_PER_S:g} ms")

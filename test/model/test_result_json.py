@@ -225,7 +225,7 @@ def test_a_file_that_was_edited_is_refused_with_the_key(key, change, tmp_path):
 def test_layout_and_time_of_creation_are_no_edits(tmp_path):
     path = written_file(tmp_path)
     before = read_result(path)
-    edited(path, lambda data: data["provenance"].__setitem__("created", "2026-01-02T03:04:05+00:00"))
+    edited(path, lambda data: data["provenance"].__setitem__("created", "2026-01-02T03:04:05Z"))
     assert_same(read_result(path), before)
 
 

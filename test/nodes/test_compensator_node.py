@@ -146,7 +146,8 @@ def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count
     publisher.publish(sample(0.02, 0.0, 0.0))
     graph.until(lambda: len(heard) == 3, "the answer to one that comes alone")
     assert node.session.counts == {"corrected": 3, "without_map": 0, "refused": 0,
-                                   "skipped": count - 1, "commands": 0, "commands_refused": 0}
+                                   "skipped": count - 1, "commands": 0, "commands_refused": 0,
+                                   "outside": 0}
 
 
 @pytest.mark.usefixtures("quick_beat")

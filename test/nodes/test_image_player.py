@@ -129,6 +129,7 @@ def test_replay_gives_the_result_of_detect_and_solve_bit_for_bit(ros_environment
     replayed, solved = read_json(replayed), read_json(solved)
     assert replayed.pop("input")["file"] == "camera" != solved.pop("input")["file"]
     for result in (replayed, solved):
+        del result["digest"]["input"]
         result["provenance"].pop("created")
     assert replayed == solved
 

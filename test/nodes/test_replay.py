@@ -91,8 +91,8 @@ def result_text(session, bag, folder, cell=None):
     """Return the text of the result that the command would write."""
     of_bag = bag_lines(bag, settings_of("measurement_collector"), cell)
     data = replay_verb.with_bag(read_json(folder / "saved.json"), of_bag,
-                                session.player.playlist.lost)
-    write_json(folder / "replayed.json", data | {"input": bag_input(str(bag))})
+                                session.player.playlist.lost, bag_input(str(bag)))
+    write_json(folder / "replayed.json", data)
     return undated((folder / "replayed.json").read_text())
 
 

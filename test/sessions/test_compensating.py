@@ -13,7 +13,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.model.result import digests_of, result_to_dict
 from selfcal_ros.sessions.compensating import KEEPS_UP, CompensatingSession
 from selfcal_ros.sessions.health import Level
 from test.support.maps import random_map, result_of
@@ -116,11 +116,35 @@ def test_a_request_is_answered_with_corrections_and_u(desk, inverse):
     np.testing.assert_array_equal([found["x"], found["y"]], wanted)
     turned = by.correct_theta(theta) if inverse else by.command_theta(theta)
     np.testing.assert_array_equal(found["theta"], turned)
-    np.testing.assert_array_equal([found["u_x"], found["u_y"]],
-                                  by.uncertainty(*(wanted if inverse else (x, y))))
+    at = np.clip(wanted, -0.02, 0.02) if inverse else (x, y)  # y = -0.02 is on the edge
+    np.testing.assert_array_equal([found["u_x"], found["u_y"]], by.uncertainty(*at))
     np.testing.assert_array_equal(found["u_theta"],
                                   by.uncertainty_theta(turned if inverse else theta))
     assert len(desk.session.answer(x, y, [], inverse=inverse)["theta"]) == 0
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_outside_the_field_u_is_not_known(desk, inverse):
+    """Not even a quarter of a pitch beyond; the edge itself belongs to the field."""
+    use(desk)
+    found = desk.session.answer([0.02, 0.0225, 0.0], [0.02, 0.0, -0.5], [], inverse=inverse)
+    np.testing.assert_array_equal(np.isfinite(found["u_x"]), [True, False, False])
+    np.testing.assert_array_equal(np.isfinite(found["u_y"]), [True, False, False])
+    assert np.isfinite([found["x"], found["y"]]).all()
+    assert "; u is not known at 2 positions: is one outside" in desk.session.remark(found)
+    inside = desk.session.answer([0.01], [0.01], [], inverse=inverse)
+    assert "u is not known" not in desk.session.remark(inside)
+
+
+def test_positions_outside_the_field_are_counted_and_told_once(desk):
+    use(desk)
+    for x in (0.0, 0.02, 0.0225):
+        assert desk.session.correct(NAMES, [x, 0.0, 0.0]) is not None
+    assert commanded(desk, NAMES, [0.0, -0.0225, 0.0]) is not None
+    said = desk.session.diagnosis()
+    assert said.level == Level.WARN and said.values["outside"] == 2
+    assert "2 positions outside the field since the last status, corrected as at" in said.message
+    assert desk.session.diagnosis().level == Level.OK
 
 
 @pytest.mark.parametrize("x, y, theta, message", [
@@ -216,6 +240,7 @@ def test_an_old_map_is_a_warning(age_s, level):
 def test_a_file_that_does_not_identify_the_stage_is_refused(tmp_path):
     data = result_to_dict(result_of(ONE))
     data["observability"]["identifiable"] = False
+    data |= {"digest": digests_of(data)}
     path = tmp_path / "map.json"
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match="the map is not qualified; measure again, or set "
