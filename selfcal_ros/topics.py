@@ -16,6 +16,7 @@ STATUS_TOPIC = "selfcal/view_status"
 MEASUREMENT_TOPIC = "selfcal/view_measurement"
 ERROR_MAP_TOPIC = "selfcal/error_map"
 SUMMARY_TOPIC = "selfcal/summary"
+PROGRESS_TOPIC = "selfcal/progress"
 MAP_MARKERS_TOPIC = "selfcal/map_markers"
 
 INPUT_TOPICS = {

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.collection.expected import Missing, ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.model.artifact import Artifact
@@ -27,6 +27,8 @@ from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
 Fields = dict[str, Any]
+NAMED_BELOW = 20
+"""Number of missing marks and lines from which a status that makes progress does not name them."""
 
 
 def header(stamp_ns: int, frame_id: str) -> Fields:
@@ -115,9 +117,15 @@ def command(c: Command, frame_id: str) -> Fields:
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
-                run_id: str = "") -> Fields:
-    """Return the fields of a selfcal_msgs/ViewStatus."""
-    readings, missing = progress.readings, progress.missing
+                run_id: str = "", name_all: bool = False) -> Fields:
+    """Return the fields of a selfcal_msgs/ViewStatus.
+
+    Missing marks and lines are named if they are fewer than `NAMED_BELOW`, or with `name_all`.
+    """
+    readings = progress.readings
+    n_missing = (progress.grid_expected - progress.grid_done
+                 + progress.angular_expected - progress.angular_done)
+    missing = progress.missing if name_all or n_missing < NAMED_BELOW else Missing()
     return {
         "header": header(stamp_ns, frame_id), "plan_id": plan_id,
         "view_index": progress.view_index, "view_name": progress.view.name,

@@ -35,7 +35,7 @@ NO_JOURNAL = "none"
 
 
 class MeasurementCollector(PollingNode[CollectorSettings]):
-    """Feed a `CollectingSession`; publish ViewStatus and ViewMeasurement.
+    """Feed a `CollectingSession`; publish ViewStatus, ViewMeasurement and the line of progress.
 
     A tick takes the received messages as bytes, writes them to the journal, decodes them
     together, and passes them to the session. A detection that may complete a view triggers a tick.
@@ -64,7 +64,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="journal"), stop)
         self._reception.open(worker)
         self._outputs = {"status": self.output(names.STATUS),
-                         "measurement": self.output(names.MEASUREMENT)}
+                         "measurement": self.output(names.MEASUREMENT),
+                         "progress": self.output(names.PROGRESS)}
         self._received = self.publisher(names.private(names.RECEIVED))
         self._inputs = {names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
                         names.DETECTIONS.name: ByTheClock(

@@ -60,6 +60,8 @@ MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(
     2 * MAX_VIEWS, latched=True))
 ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, msg.ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic(topics.SUMMARY_TOPIC, msg.CalibrationSummary, _qos(1, latched=True))
+PROGRESS = Topic(topics.PROGRESS_TOPIC, String, _qos(1, latched=True))
+"""One line for a person."""
 MAP_MARKERS = Topic(topics.MAP_MARKERS_TOPIC, MarkerArray, _qos(1, latched=True))
 CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
 MOTION = Topic(topics.MOTION_TOPIC, JointState, _qos(1000))

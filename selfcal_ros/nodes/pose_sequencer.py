@@ -40,6 +40,7 @@ class CalibrationAction:
         self._node, self._session = node, session
         self._taken = False  # from the acceptance of a goal, before it is executed, to its end
         self._goal: Any = None
+        self._feedback: Any = None  # of this goal, the last
         self._ended: Future | None = None
         self._saved: Future | None = None
         self._save_until = 0.0
@@ -53,7 +54,7 @@ class CalibrationAction:
             ActionServer.destroy)
 
     def tick(self) -> None:
-        """Give feedback; handle a cancelled goal and a solver that does not answer."""
+        """Give changed feedback; handle a cancelled goal and a solver that does not answer."""
         if self._goal is None:
             return
         if self._goal.is_cancel_requested and not self._session.ended:
@@ -61,10 +62,14 @@ class CalibrationAction:
         if time.monotonic() > self._save_until:
             _complete(self._saved)
         view = self._session.current
-        if view is not None:
-            self._goal.publish_feedback(RunCalibration.Feedback(
-                view=view.name, view_index=self._session.machine.index,
-                coverage=self._session.coverage))
+        if view is None:
+            return
+        feedback = RunCalibration.Feedback(
+            view=view.name, view_index=self._session.machine.index,
+            coverage=self._session.coverage)
+        if feedback != self._feedback:
+            self._feedback = feedback
+            self._goal.publish_feedback(feedback)
 
     def _on_goal(self, _: Any) -> GoalResponse:
         if self._session.ended and not self._taken:
@@ -88,7 +93,7 @@ class CalibrationAction:
         try:
             if goal.request.plan_path:
                 self._session.machine.plan = read_plan(goal.request.plan_path)
-            self._goal, self._ended = goal, Future()
+            self._goal, self._ended, self._feedback = goal, Future(), None
             self._session.begin()
             await self._ended
             await self._conclude(goal, result)

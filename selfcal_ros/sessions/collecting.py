@@ -23,25 +23,30 @@ from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import Measurements, placing_digest, session_digest, view_digest
 from selfcal_ros.sessions.clocks import ClockWatch, RunWatch
 from selfcal_ros.sessions.health import CellChecks, Diagnosis, Level, Ports, Rate, merged
+from selfcal_ros.sessions.progress import progress_line
 from selfcal_ros.sessions.rejections import RejectionWatch
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 
 HEARD_S = 1.0
 """Time without an encoder sample after which the encoder counts as silent."""
+STUCK_S = 5.0
+"""Time without a new reading after which a view is stuck: its missing marks are named."""
+PROGRESS_S = 0.5
+"""Shortest time between two lines of progress."""
 Age = int | np.ndarray
 """Time since the reception of messages, ns: of the newest, or int64 array of each, newest last."""
 
 
 class CollectingSession:
-    """Feed a `Collector`; publish ``status``, and ``measurement`` when a view completes.
+    """Feed a `Collector`; publish ``status``, ``progress``, and ``measurement`` of complete views.
 
     Parameters
     ----------
     settings : CollectorSettings
         Values of the collector's parameters.
     ports : Ports
-        Publishes ``status`` and ``measurement``.
+        Publishes ``status``, ``measurement`` and ``progress``.
     """
 
     def __init__(self, settings: CollectorSettings, ports: Ports) -> None:
@@ -49,6 +54,9 @@ class CollectingSession:
         self.collector = Collector(settings)
         self._dirty, self._next_status, self._rested = False, 0.0, 0.0
         self._needed = 0  # readings needed to complete the open view
+        self._moved = (-1, 0, 0.0)  # the open view, its readings needed, and since when
+        self._named = False  # as stuck, since then
+        self._line, self._told_line, self._told_s = "", "", float("-inf")
         self._unseen: list[np.ndarray] = []  # its detections since the last status, by their stamps
         self._since_ns = 0  # its beginning
         self._costs: deque[tuple[float, float]] = deque(maxlen=1000)  # time, and CPU time
@@ -165,10 +173,11 @@ class CollectingSession:
 
     def tick(self) -> None:
         """Publish the progress of the views, if there are new messages and it is due."""
-        if not self._dirty:
+        now, worked = self._ports.now_s(), self._ports.cpu_s()
+        self._tell_progress(now)
+        if not self._dirty and not (self._is_stuck(now) and not self._named):
             self._rejections.tell()
             return
-        now, worked = self._ports.now_s(), self._ports.cpu_s()
         early = now < self._next_status
         if early and not (now >= self._rested and self._may_complete()):
             return
@@ -177,6 +186,7 @@ class CollectingSession:
             measurements, progress = self.collector.collect()
         except NoDataError:
             self._rejected = Counter(self.collector.unusable)
+            self._note_progress({}, now)
             return
         except InputError as error:  # valid for this run: report once
             if self._problem != str(error):
@@ -184,6 +194,7 @@ class CollectingSession:
                 self._ports.say(Level.ERROR, f"{error}; then start a new run")
             return
         self._problem = ""
+        self._note_progress(progress, now)
         self._publish(measurements, progress, final=False)
         self._describe(measurements, progress)
         spent = self._ports.now_s() - now
@@ -191,6 +202,29 @@ class CollectingSession:
         if early and self._needed:  # in vain: some detections were not readings
             self._rested = now + 5 * spent
         self._next_status = now + max(self.settings.status_period, 5 * spent)
+
+    def _note_progress(self, progress: dict[int, ViewProgress], now_s: float) -> None:
+        """Note when the open view had its last reading, and make its line."""
+        command = self.collector.newest_command
+        if command is None:
+            return
+        view = progress.get(command.view_index) if command.phase == Phase.MEASURE else None
+        state = (command.view_index, 0 if view is None else view.needed)
+        if state != self._moved[:2]:
+            self._moved, self._named = (*state, now_s), False
+        self._line = progress_line(command, view)
+        self._tell_progress(now_s)
+
+    def _is_stuck(self, now_s: float) -> bool:
+        """Return whether readings are missing in the open view and none has come for long."""
+        _, needed, since_s = self._moved
+        return needed > 0 and now_s - since_s >= STUCK_S
+
+    def _tell_progress(self, now_s: float) -> None:
+        """Publish the line of progress, if it has changed and the last one is old enough."""
+        if self._line != self._told_line and now_s - self._told_s >= PROGRESS_S:
+            self._told_line, self._told_s = self._line, now_s
+            self._ports.publish("progress", {"data": self._line})
 
     def expects_end(self, more: int = 0) -> bool:
         """Return whether the detections received and `more` may complete the view."""
@@ -208,12 +242,15 @@ class CollectingSession:
     def finish(self) -> str:
         """Publish every view as it is and return the digest of all readings."""
         measurements, progress = self.collector.collect()
+        self._note_progress(progress, self._ports.now_s())
         self._publish(measurements, progress, final=True)
         return session_digest(self._published)
 
     def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
                  final: bool) -> None:
         timeline, frame_id = self.collector.timeline, self.settings.frame_id
+        stuck = self._is_stuck(self._ports.now_s())
+        self._named |= stuck
         if (timeline.plan_id, timeline.run_id) != self._run:
             self._run, self._published = (timeline.plan_id, timeline.run_id), {}
             self._noted = []
@@ -242,8 +279,9 @@ class CollectingSession:
                         self._stepped))
             # after the readings: a complete view can be solved
             if current or index == max(progress) or final:
-                fields = from_model.view_status(view, timeline.plan_id, stamp, frame_id,
-                                                 run_id=timeline.run_id)
+                fields = from_model.view_status(
+                    view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id,
+                    name_all=stuck or index in ended)
                 fields["complete"] &= not self._clock.ahead  # may be of another view
                 self._ports.publish("status", fields)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """pose_sequencer: services, status, foreign commands, time-outs and the action."""
 
-from itertools import product
+from itertools import pairwise, product
 from types import SimpleNamespace
 
 import pytest
@@ -303,6 +303,7 @@ def test_the_action_runs_the_plan_and_names_the_map(actor, tmp_path):
     assert (result.error_code, result.map_path) == (0, str(tmp_path / "map.json"))
     assert actor.saved == [result.map_path]
     assert {f.view for f in actor.feedback} <= {view.name for view in PLAN.views}
+    assert all(one != other for one, other in pairwise(actor.feedback))
 
 
 def test_a_cancelled_goal_aborts_the_plan(actor):

@@ -11,7 +11,6 @@ from typing import Any, TextIO
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.error_map import ErrorMap, datum_modes, remove_modes, rms
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M, URAD_PER_RAD
@@ -210,20 +209,26 @@ def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
     """
     if result is None:
         return dict.fromkeys(_SUMMARY_FIELDS, math.nan)
-    figures, between = map_figures(result.error_map), budget_anywhere(result)
+    figures, (u_rms, u_max, _) = map_figures(result.error_map), anywhere_m(result)
     return {"max_error_um": figures.max_error_m * UM_PER_M,
             "rms_error_um": figures.rms_error_m * UM_PER_M,
             "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
             "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
             "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD,
-            "rms_uncertainty_anywhere_um": (between.u_rms if between else math.nan) * UM_PER_M,
-            "max_uncertainty_anywhere_um": (between.u_max if between else math.nan) * UM_PER_M}
+            "rms_uncertainty_anywhere_um": u_rms * UM_PER_M,
+            "max_uncertainty_anywhere_um": u_max * UM_PER_M}
 
 
-def budget_anywhere(result: CalibrationResult) -> Budget | None:
-    """Return the budget of a coordinate anywhere in the field; None without an uncertainty map."""
+def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
+    """Return u rms, u at most and U at most of a coordinate anywhere in the field, m.
+
+    NaN without an uncertainty map.
+    """
+    from selfcal_ros.estimation.verdict.uncertainty import budgets  # with scipy, not for figures
+
     found = (budget for budget in budgets(result) if budget.quantity == "xy" and budget.anywhere)
-    return next(found, None)
+    budget = next(found, None)
+    return (math.nan,) * 3 if budget is None else (budget.u_rms, budget.u_max, budget.U_max)
 
 
 _SUMMARY_FIELDS = (

@@ -21,8 +21,8 @@ from selfcal_ros.reporting.summary.numbers import (
     MapFigures,
     aligned,
     aligned_numbers,
+    anywhere_m,
     arcsec,
-    budget_anywhere,
     camera_facts,
     counted,
     decimals_for,
@@ -359,8 +359,7 @@ def state_line(result: CalibrationResult) -> str:
 
     It shows 128 characters. The reason of a grade below good follows.
     """
-    figures, between = map_figures(result.error_map), budget_anywhere(result)
-    verdict = result.verdict
+    figures, verdict = map_figures(result.error_map), result.verdict
     if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
         return state_sentence(result)
 
@@ -368,7 +367,7 @@ def state_line(result: CalibrationResult) -> str:
     if figures.n_known:
         parts.append(f"error up to {um(figures.max_error_m)}")
         parts.append(f"U {um(result.noise.k_xy * figures.max_u_m)} at the nodes")
-        parts.append(f"{um(between.U_max if between else math.nan)} anywhere")
+        parts.append(f"{um(anywhere_m(result)[2])} anywhere")
     line = ", ".join(parts)
     if figures.n_lines_known:
         u_theta = arcsec(result.noise.k_theta * figures.max_u_theta_rad)
