@@ -3,7 +3,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -145,16 +145,16 @@ def _metres(text: str, where: str) -> float:
     return value
 
 
-def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: str | Path, *,
+def write_pictures(folder: Path, rows: Sequence[Position], plan: Plan, output: str | Path, *,
                    detect: Callable[[bytes, str, int], Iterable[Detection]],
-                   frame_id: str) -> Counter[str]:
+                   check: Callable[[], None], frame_id: str) -> Counter[str]:
     """Write a bag of the commands of a plan, the positions and the detections in the images.
 
     Parameters
     ----------
     folder : Path
         Folder of the images.
-    rows : iterable of Position
+    rows : sequence of Position
         The exposures, by view.
     plan : Plan
         The plan.
@@ -162,6 +162,8 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
         Bag folder to create.
     detect : callable (content of an image file, its name, stamp in ns)
         Returns the detections; may raise InputError.
+    check : callable
+        Called before the bag is complete; what it raises leaves no bag.
     frame_id : str
         Frame of the detections.
 
@@ -169,11 +171,21 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
     -------
     Counter
         Problem -> number of images that were not used.
+
+    Raises
+    ------
+    NoDataError
+        If a file of the table is not in the folder.
     """
+    missing = [row for row in rows if not (folder / row.file).is_file()]
+    if missing:
+        number = f" ({len(missing)} of {len(rows)} files are not)" if len(missing) > 1 else ""
+        raise NoDataError(missing[0].where, f"{missing[0].file} is not in {folder}{number}",
+                          "correct the table, or name the folder of its images")
     problems: Counter[str] = Counter()
     latched = qos_profile(reliable=True, transient_local=True, depth=64)
     volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
-    rows, view = list(rows), -1
+    view = -1
     now = rows[0].stamp_ns - STEP_NS if rows and rows[0].stamp_ns is not None else START_NS
     run_id = str(now)
 
@@ -207,6 +219,7 @@ def write_pictures(folder: Path, rows: Iterable[Position], plan: Plan, output: s
                 writer.write(f"/{DETECTION_TOPIC}", from_model.detection(detection, frame_id), now)
         now += STEP_NS
         command(Phase.DONE, len(plan.views))
+        check()
     return problems
 
 
@@ -330,8 +343,8 @@ class ImageBag:
             self.lost[f"messages on {channel.topic} could not be decoded"] += 1
             return None
 
-    def write_detected(self, output: str | Path, detect: Callable[[Any], Iterable[Detection]],
-                       frame_id: str) -> Counter[str]:
+    def write_detected(self, output: str | Path, detect: Callable[[Any], Iterable[Detection]], *,
+                       check: Callable[[], None], frame_id: str) -> Counter[str]:
         """Write a bag of all messages other than images, and the detections in the images.
 
         Parameters
@@ -340,6 +353,8 @@ class ImageBag:
             Folder to create.
         detect : callable (message)
             Returns the detections in an image; may raise InputError.
+        check : callable
+            Called before the bag is complete; what it raises leaves no bag.
         frame_id : str
             Frame of the detections.
 
@@ -371,6 +386,7 @@ class ImageBag:
                 for detection in found:
                     writer.write(topic, from_model.detection(detection, frame_id),
                                  item.message.log_time)
+            check()
         return problems + self.lost
 
 

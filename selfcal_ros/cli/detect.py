@@ -4,7 +4,9 @@
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
@@ -15,7 +17,10 @@ from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.outputs import write_bytes
+from selfcal_ros.vision.detector import Judged, Mark
+from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector
+from selfcal_ros.vision.images import Picture
 
 SHOWN = 5
 """Number of problems that are printed."""
@@ -36,6 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "of mark_detector is used")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the camera, for bags "
                         "with several cells; / is the root")
+    parser.add_argument("--draw", metavar="FOLDER", help="write each image there as PNG, with "
+                        "circles around what was found, squares and reasons around the rejected")
     add_json(parser)
 
 
@@ -43,12 +50,14 @@ def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
     settings = replace(node_settings(args.params, DetectorSettings, **given(args, OPTIONS)),
                        max_marks=ANY_NUMBER)
-    detector = ImageDetector(settings, args.params or "options")
+    draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
+    detector = ImageDetector(settings, args.params or "options", draw)
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)
     else:
         problems = ImageBag(Path(args.bag), args.namespace).write_detected(
-            args.output, detector.take, settings.frame_id)
+            args.output, detector.take, check=partial(detector.refuse_nothing, args.bag),
+            frame_id=settings.frame_id)
     truth = Path(args.bag, TRUTH_FILE)
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
@@ -67,7 +76,20 @@ def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str)
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
     plan = read_plan(args.plan)
     return write_pictures(Path(args.bag), read_positions(args.positions, plan), plan, args.output,
-                          detect=detector.take_file, frame_id=frame)
+                          detect=detector.take_file,
+                          check=partial(detector.refuse_nothing, args.bag), frame_id=frame)
+
+
+def _drawn(folder: Path, settings: DetectorSettings, name: str, picture: Picture,
+           judged: Sequence[Judged]) -> None:
+    """Write an image with what was found and what was rejected in it."""
+    marks = [(each.u, each.v) for each in judged if isinstance(each.found, Mark)]
+    rejected = [(each.u, each.v, str(each.found)) for each in judged
+                if not isinstance(each.found, Mark)]
+    size = settings.mark_size / settings.pixel_size
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bytes(folder / f"{Path(name).stem}.png",
+                circled(picture.values, marks, size, rejected))
 
 
 def text_of(output: str, found: dict[str, int]) -> str:

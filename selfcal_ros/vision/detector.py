@@ -2,7 +2,7 @@
 """Mark detections of images: candidates, fits, reasons of rejection, offsets in stage axes."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -16,6 +16,7 @@ from selfcal_ros.vision.finding import Candidate, candidates
 from selfcal_ros.vision.fitting import Fit, Windows, fit_marks, lie_inside, windows_of
 from selfcal_ros.vision.images import Picture
 from selfcal_ros.vision.models import MODELS
+from selfcal_ros.vision.shown import spots_in
 
 SMALLEST_SIZE, LARGEST_SIZE = 6.0, 2000.0
 """Range of the size of a mark, px."""
@@ -70,6 +71,15 @@ class Mark:
     fit: Fit
 
 
+@dataclass(frozen=True)
+class Judged:
+    """A possible mark: where it was looked for, px, and the mark, or why there is none."""
+
+    u: float
+    v: float
+    found: Mark | Fault
+
+
 class MarkDetector:
     """Find the marks of images.
 
@@ -104,8 +114,8 @@ class MarkDetector:
                              "give the width of one line")
         self._sign = 0 if settings.mark == "corner" else 1 if settings.polarity == "bright" else -1
 
-    def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
-        """Return the marks of an image, row by row, and the number of rejected ones by reason.
+    def judged(self, picture: Picture) -> list[Judged]:
+        """Return the possible marks of an image, row by row.
 
         Raises
         ------
@@ -115,14 +125,20 @@ class MarkDetector:
         image, full = picture.values, self.settings.full_scale or picture.full_scale
         seen = candidates(image, mark=self.settings.mark, size=self.size, width=self._width,
                           sign=self._sign, most=self.settings.max_marks)
-        found: list[Mark] = []
-        faults: Counter[str] = Counter()
-        for mark in _without_doubles(self._fitted(image, seen, full), SAME * self.size):
-            if isinstance(mark, Mark):
-                found.append(mark)
-            else:
-                faults[str(mark)] += 1
-        return found, faults
+        found = _without_doubles(self._fitted(image, seen, full), SAME * self.size)
+        return [Judged(mark.u, mark.v, mark) if isinstance(mark, Mark)
+                else Judged(candidate.column, candidate.row, mark)
+                for candidate, mark in zip(seen, found, strict=True)]
+
+    def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
+        """Return the marks of an image, row by row, and the number of rejected ones by reason.
+
+        Raises
+        ------
+        InputError
+            As `judged`.
+        """
+        return told_apart(self.judged(picture))
 
     def _fitted(self, image: np.ndarray, seen: list[Candidate], full: int) -> list[Mark | Fault]:
         """Return the mark at each candidate, or why there is none.
@@ -201,17 +217,56 @@ class MarkDetector:
             return Fault.WEAK
         return None
 
-    def detections(self, picture: Picture, stamp_ns: int,
-                   ) -> tuple[list[Detection], Counter[str]]:
-        """Return the detections of an image, and the number of rejected marks by reason."""
-        marks, faults = self.marks(picture)
+    def nothing_found(self, picture: Picture | None, rejected: Counter[str]) -> tuple[str, str]:
+        """Return what is wrong with images without a mark, and what to change.
+
+        Parameters
+        ----------
+        picture : Picture or None
+            One of them.
+        rejected : Counter
+            Reason -> possible marks that were rejected in all of them.
+        """
+        given = self.settings
+        wanted = f"no {'' if self._sign == 0 else given.polarity + ' '}{given.mark} of " \
+                 f"{self.size:.3g} px was found"
+        reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
+        said = wanted + (f"; rejected: {reasons}" if reasons else "")
+        spots = None if picture is None else spots_in(picture.values)
+        if spots is None:
+            return f"{said}; nothing repeats in them", "check exposure and focus"
+        options = []
+        if abs(spots.side_px / self.size - 1) > given.size_tolerance:
+            options.append(f"--mark-size {spots.side_px * given.pixel_size:.2g}")
+        if self._sign and spots.polarity != given.polarity:
+            options.append(f"--polarity {spots.polarity}")
+        seen = f"{said}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+        return seen, (f"try {' '.join(options)}" if options else
+                      "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
+                      "corner)?")
+
+    def detections(self, marks: Iterable[Mark], shape: tuple[int, ...], stamp_ns: int,
+                   ) -> list[Detection]:
+        """Return the marks of an image of this shape (h, w) as detections."""
         out = []
         for mark in marks:
-            x, y = offset(mark.u, mark.v, picture.values.shape, self.settings)
+            x, y = offset(mark.u, mark.v, shape, self.settings)
             sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2))
             out.append(Detection(stamp_ns, int(Kind.GRID), False, 0, 0, 0, x, y, 0.0, sigma,
                                  mark.score))
-        return out, faults
+        return out
+
+
+def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
+    """Return the marks, and the number of rejected ones by reason."""
+    marks: list[Mark] = []
+    faults: Counter[str] = Counter()
+    for each in judged:
+        if isinstance(each.found, Mark):
+            marks.append(each.found)
+        else:
+            faults[str(each.found)] += 1
+    return marks, faults
 
 
 def _without_doubles(marks: list[Mark | Fault], near: float) -> list[Mark | Fault]:

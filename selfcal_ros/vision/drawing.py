@@ -9,13 +9,15 @@ from PIL import Image, ImageDraw
 
 RADIUS = 0.75
 """Radius of a circle, in sizes of the mark."""
-COLOUR, AXIS = (255, 80, 0), (0, 160, 255)
+COLOUR, AXIS, REJECTED = (0, 190, 90), (0, 160, 255), (255, 60, 0)
 
 
-def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: float) -> bytes:
+def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: float,
+            rejected: Sequence[tuple[float, float, str]] = ()) -> bytes:
     """Return an image as PNG, stretched to its range, with a circle around every mark.
 
-    A cross shows the optical axis, the centre of the image.
+    A square with a reason stands around what was rejected. A cross shows the optical axis, the
+    centre of the image.
 
     Parameters
     ----------
@@ -25,6 +27,8 @@ def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: f
         Columns and rows of the marks.
     size_px : float
         Size of a mark.
+    rejected : sequence of (u, v, reason)
+        Possible marks that were rejected.
     """
     low, high = float(pixels.min()), float(pixels.max())
     grey = ((pixels - low) * (255 / max(high - low, 1.0))).astype(np.uint8)
@@ -34,6 +38,10 @@ def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: f
     radius = RADIUS * size_px
     for u, v in marks:
         draw.ellipse([u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line)
+    for u, v, reason in rejected:
+        draw.rectangle([u - radius, v - radius, u + radius, v + radius], outline=REJECTED,
+                       width=line)
+        draw.text((u - radius, v + radius + line), reason, fill=REJECTED)
     u, v, arm = (pixels.shape[1] - 1) / 2, (pixels.shape[0] - 1) / 2, size_px / 2
     draw.line([u - arm, v, u + arm, v], fill=AXIS, width=line)
     draw.line([u, v - arm, u, v + arm], fill=AXIS, width=line)

@@ -2,16 +2,16 @@
 """A series of images into detections, the same live and from a bag; everything is counted."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.errors import InputError, printable
+from selfcal_ros.errors import InputError, NoDataError, printable
 from selfcal_ros.messages.to_model import stamp_ns
-from selfcal_ros.vision.detector import MarkDetector
+from selfcal_ros.vision.detector import Judged, MarkDetector, told_apart
 from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 
 SETTLED = 3
@@ -19,6 +19,10 @@ SETTLED = 3
 
 MOST_STAMPS = 100_000
 """Most stamps that are kept to refuse repeated images: an hour of 30 a second."""
+
+
+Draw = Callable[[str, Picture, Sequence[Judged]], None]
+"""Name of an image, the image, and its possible marks -> nothing."""
 
 
 @dataclass
@@ -63,11 +67,24 @@ class ImageDetector:
         Values of the parameters of mark_detector.
     where : str
         Place of these for errors.
+    draw : callable, optional
+        Called with the name of each image, the image, and its possible marks.
+
+    Attributes
+    ----------
+    counts : Counts
+        What became of the images.
+    problems : Counter
+        Line -> number of images that could not be used.
     """
 
-    def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
+    def __init__(self, settings: DetectorSettings, where: str = "mark_detector",
+                 draw: Draw | None = None) -> None:
         self._detector = MarkDetector(settings, where)
         self.counts = Counts()
+        self.problems: Counter[str] = Counter()
+        self.draw = draw
+        self._empty: Picture | None = None  # an image without marks, until there is a mark
         self._source = _Source()
         self._stamps: dict[int, None] = {}  # of the images used, in their order
 
@@ -91,6 +108,24 @@ class ImageDetector:
         """Return the detections of grey values exposed at `stamp`, ns; raises like `take`."""
         return self._detect(lambda check: picture, stamp, "image")
 
+    def refuse_nothing(self, where: str) -> None:
+        """Refuse images in which no mark was found, and say what they show instead.
+
+        Raises
+        ------
+        NoDataError
+            If there is no detection.
+        """
+        counts = self.counts
+        if counts.marks:
+            return
+        if not counts.images:
+            why = "".join(f": {line}" for line, _ in self.problems.most_common(1))
+            raise NoDataError(where, f"no image could be used{why}", "correct the images" if why
+                              else "record stage/image, or name the folder of the images")
+        raise NoDataError(where, *self._detector.nothing_found(
+            self._empty, rejected=counts.rejected))
+
     def _detect(self, decode: Callable[[Check], Picture], stamp: int, name: str, *,
                 camera: str = "") -> list[Detection]:
         try:
@@ -100,10 +135,17 @@ class ImageDetector:
             picture = decode(lambda shape: self._refuse_other((camera, *shape), name))
             if not self._source.agrees(seen := (camera, *picture.values.shape)):
                 raise other_source(self._source.image, seen, name)
-            found, rejected = self._detector.detections(picture, stamp)
-        except InputError:
+            judged = self._detector.judged(picture)
+        except InputError as error:
             self.counts.refused += 1
+            self.problems[str(error)] += 1
             raise
+        if self.draw is not None:
+            self.draw(name if name != "image" else str(stamp), picture, judged)
+        marks, rejected = told_apart(judged)
+        found = self._detector.detections(marks, picture.values.shape, stamp)
+        if not self.counts.marks and not found:
+            self._empty = picture
         self._stamps[stamp] = None
         if len(self._stamps) > MOST_STAMPS:
             del self._stamps[next(iter(self._stamps))]

@@ -3,6 +3,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 
 import mcap.reader
@@ -14,10 +15,9 @@ from PIL import Image
 
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.schemas import store_with
-from selfcal_ros.bagio.writer import BagWriter, build
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main
 from selfcal_ros.files import read_json
-from selfcal_ros.messages import from_model
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,
@@ -26,6 +26,7 @@ from selfcal_ros.topics import (
     IMAGE_TYPES,
     INPUT_TOPICS,
 )
+from selfcal_ros.vision.drawing import COLOUR, REJECTED
 
 SIM = """
 plan:
@@ -203,9 +204,7 @@ def test_topics_of_foreign_types_are_kept(bag, tmp_path):
         text = store_with(IMAGE_TYPES["raw"]).generate_msgdef(IMAGE_TYPES["raw"], ros_version=2)[0]
         image = writer.register_channel("/stage/image", "cdr", writer.register_schema(
             IMAGE_TYPES["raw"], "ros2msg", text.encode()))
-        fields = from_model.image(np.full((64, 72), 200, np.uint8), "mono8", 5, "camera")
-        stamp = store_with(IMAGE_TYPES["raw"])
-        data = bytes_of(build(stamp, IMAGE_TYPES["raw"], fields))
+        data = bytes_of(next(item.image for item in items(bag) if item.is_image))
         writer.add_message(image, 7, data, 7)
         writer.add_message(odd, 8, b"\0\1\0\0" + bytes(8), 6, 3)
         writer.finish()
@@ -311,21 +310,28 @@ def test_a_table_without_rows_is_no_data(tmp_path, capsys):
     assert not (tmp_path / "found").exists()
 
 
-def test_missing_and_damaged_files_are_one_line_each(tmp_path, capsys):
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
-    (tmp_path / "p.csv").write_text("# by hand\nfile,view,x,y\n" + "".join(
-        f"{name}.png,shift,0,0\n" for name in "abcd"))
-    (tmp_path / "a.png").write_bytes(b"no image")
-    for name, height in (("c", 60), ("d", 50)):
-        Image.fromarray(np.zeros((height, 60), np.uint8)).save(tmp_path / f"{name}.png")
-    assert detect(tmp_path, tmp_path / "found", "--positions", str(tmp_path / "p.csv"), "--plan",
-                  str(tmp_path / "plan.yaml")) == 0
-    printed = capsys.readouterr()
-    damaged, missing, other_size = printed.err.splitlines()
-    assert "a.png: not an image, or damaged; give PNG, JPEG or TIFF" in damaged
-    assert "b.png: no such file" in missing
-    assert "d.png: 60 x 50 pixels, but earlier images have 60 x 60" in other_size
-    assert "0 marks in 1 images" in printed.out
+def test_damaged_files_are_one_line_each(tmp_path, capsys):
+    folder, plan = pictures(tmp_path), tmp_path / "plan.yaml"
+    files = sorted(folder.glob("*.png"))
+    files[4].write_bytes(b"no image")
+    Image.fromarray(np.zeros((50, 60), np.uint8)).save(files[6])
+    assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
+                  "--plan", str(plan)) == 0
+    damaged, other_size = capsys.readouterr().err.splitlines()
+    assert f"{files[4].name}: not an image, or damaged; give PNG, JPEG or TIFF" in damaged
+    assert f"{files[6].name}: 60 x 50 pixels, but earlier images have 72 x 64" in other_size
+
+
+def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(tmp_path, capsys):
+    folder, plan = pictures(tmp_path), tmp_path / "plan.yaml"
+    files = sorted(folder.glob("*.png"))
+    for file in files[2:4]:
+        file.unlink()
+    assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
+                  "--plan", str(plan)) == 4
+    line, = capsys.readouterr().err.splitlines()
+    assert f"positions.csv:4: {files[2].name} is not in {folder} (2 of 140 files are not)" in line
+    assert not (tmp_path / "found").exists()
 
 
 def test_positions_without_a_plan_are_refused(bag, tmp_path, capsys):
@@ -365,3 +371,55 @@ def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
     for axis in ("gx", "gy"):
         away = np.array(result["error_map"][axis], float) - truth[axis]
         assert np.abs(away).max() < 0.2 * np.abs(truth[axis]).max()
+
+
+@pytest.mark.parametrize("options, said", [
+    (["--mark-size", "30e-6"], r"no dark disc of 10 px was found.*; what repeats is (19|20)[.\d]* "
+                               r"px, dark; try --mark-size (5\.[89]|6|6\.1)e-05$"),
+    (["--polarity", "bright"], r"no bright disc of 20 px was found.*; try --polarity dark$")])
+def test_images_without_the_mark_say_what_they_show_instead(bag, tmp_path, capsys, options, said):
+    assert detect(bag, tmp_path / "found", *options) == 4
+    line, = capsys.readouterr().err.splitlines()
+    assert re.search(said, line), line
+    assert not (tmp_path / "found").exists()
+
+
+def test_images_with_nothing_in_them_are_refused(bag, tmp_path, capsys):
+    def flat(number, message):
+        message.data = np.full_like(message.data, 100)
+        return bytes_of(message)
+
+    rewritten(bag, tmp_path / "flat", flat)
+    assert detect(tmp_path / "flat", tmp_path / "found") == 4
+    assert "nothing repeats in them; check exposure and focus" in capsys.readouterr().err
+
+
+def test_a_bag_none_of_whose_images_can_be_used_is_refused(bag, tmp_path, capsys):
+    def unknown(number, message):
+        message.encoding = "yuv422"
+        return bytes_of(message)
+
+    rewritten(bag, tmp_path / "unknown", unknown)
+    assert detect(tmp_path / "unknown", tmp_path / "found") == 4
+    assert "no image could be used: image: encoding 'yuv422'" in capsys.readouterr().err
+
+
+def test_images_are_drawn_with_what_was_found_and_what_was_rejected(bag, tmp_path):
+    """Green around a mark, red around a mark that a fibre crosses."""
+    def dirty(number, message):
+        if number == 0:
+            message.data = message.data.copy()
+            pixels = message.data.reshape(message.height, message.width)
+            pixels[:, message.width // 2:message.width // 2 + 3] = 0
+        return bytes_of(message)
+
+    rewritten(bag, tmp_path / "dirty", dirty)
+    assert detect(tmp_path / "dirty", tmp_path / "found", "--draw", str(tmp_path / "drawn")) == 0
+    pictures = sorted((tmp_path / "drawn").glob("*.png"))
+    assert len(pictures) == 20
+    colours = []
+    for picture in pictures[:2]:
+        pixels = np.asarray(Image.open(picture)).reshape(-1, 3)
+        colours.append({tuple(colour) for colour in np.unique(pixels, axis=0).tolist()})
+    assert REJECTED in colours[0] and COLOUR not in colours[0]
+    assert COLOUR in colours[1] and REJECTED not in colours[1]

@@ -98,7 +98,8 @@ def test_pixels_are_counted_from_the_centre_of_the_first_one_and_rows_run_down()
     for turn, mirror, expected in ((0.0, False, (left, up)), (0.0, True, (-left, up)),
                                    (90.0, False, (-up, left)), (90.0, True, (-up, -left)),
                                    (180.0, False, (-left, -up)), (-90.0, False, (up, -left))):
-        [found] = detector(**given, turn=turn, mirror=mirror).detections(picture(values), 7)[0]
+        eye = detector(**given, turn=turn, mirror=mirror)
+        [found] = eye.detections(eye.marks(picture(values))[0], values.shape, 7)
         assert (found.offset_x, found.offset_y) == pytest.approx(expected, abs=1e-11)
         assert found.stamp_ns == 7 and not found.has_id and found.kind == 0
 
@@ -128,7 +129,7 @@ def test_sigma_is_the_uncertainty_in_metres():
     cell = camera(read_noise=0.02)
     image = picture(cell.image(np.zeros((2, 1)), np.random.default_rng(2)))
     [mark], _ = detector().marks(image)
-    [found], _ = detector().detections(image, 0)
+    [found] = detector().detections([mark], image.values.shape, 0)
     assert found.sigma == pytest.approx(
         PIXEL * np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2), rel=1e-12)
     assert found.score == mark.score > 0.98

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an image shows that repeats: for the advice where no mark of the given size was found."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+SMALLEST = 4
+"""Smallest side of a spot, px: less is noise."""
+ALIKE = 0.3
+"""Spots whose sides differ from their median by less than this part are alike."""
+LARGEST = 0.5
+"""Largest side of a spot, over the shorter side of the image."""
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Spots of one size in an image: their side, px, whether they are dark, and their number."""
+
+    side_px: float
+    polarity: str
+    number: int
+
+
+def spots_in(image: np.ndarray) -> Spots | None:
+    """Return the most frequent kind of spots in an image (h, w); None if there are none.
+
+    Dark and bright parts about a threshold between the two (Otsu) are compared: those of the
+    marks are small, alike, and do not reach the border of the image.
+    """
+    level = _threshold(image)
+    if level is None:
+        return None
+    kinds = [found for polarity, mask in (("dark", image <= level), ("bright", image > level))
+             if (found := _alike(mask, polarity)) is not None]
+    return max(kinds, key=lambda found: found.number, default=None)
+
+
+def _threshold(image: np.ndarray) -> float | None:
+    """Return the grey value between dark and bright that separates them best; None if all are one.
+
+    The variance between the two classes is the largest (Otsu 1979).
+    """
+    counts, edges = np.histogram(image, bins=256)
+    if np.count_nonzero(counts) < 2:
+        return None
+    values = (edges[:-1] + edges[1:]) / 2
+    below = np.cumsum(counts)[:-1]
+    above = image.size - below
+    total, sums = float(counts @ values), np.cumsum(counts * values)[:-1]
+    mean_below, mean_above = sums / np.maximum(below, 1), (total - sums) / np.maximum(above, 1)
+    between = below * above * np.square(mean_above - mean_below)
+    return float(edges[1:-1][np.argmax(between)])
+
+
+def _alike(mask: np.ndarray, polarity: str) -> Spots | None:
+    labels, number = ndimage.label(mask)
+    if not number:
+        return None
+    sides = []
+    for rows, columns in ndimage.find_objects(labels):
+        inside = (rows.start > 0 and columns.start > 0 and rows.stop < mask.shape[0]
+                  and columns.stop < mask.shape[1])
+        side = (rows.stop - rows.start + columns.stop - columns.start) / 2
+        if inside and SMALLEST <= side <= LARGEST * min(mask.shape):
+            sides.append(side)
+    if not sides:
+        return None
+    typical = float(np.median(sides))
+    alike = [side for side in sides if abs(side - typical) <= ALIKE * typical]
+    return Spots(float(np.mean(alike)), polarity, len(alike))

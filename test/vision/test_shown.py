@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What repeats in an image: its side and whether it is dark, from drawn spots."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.vision.shown import spots_in
+
+
+def spots(side, *, dark, pitch=60, shape=(300, 360)):
+    """Return an image of discs on a lattice, half of the ground in a slope, with noise."""
+    v, u = np.mgrid[:shape[0], :shape[1]].astype(float)
+    away = np.hypot((u % pitch) - pitch / 2, (v % pitch) - pitch / 2)
+    inside = away <= side / 2
+    ground, mark = (180.0, 60.0) if dark else (60.0, 180.0)
+    noise = np.random.default_rng(1).normal(0, 4, shape)
+    return np.clip(np.where(inside, mark, ground) + 0.05 * u + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("dark", [True, False])
+@pytest.mark.parametrize("side", [9, 21, 35])
+def test_the_side_and_the_polarity_of_what_repeats(side, dark):
+    found = spots_in(spots(side, dark=dark))
+    assert found.number == 30
+    assert found.side_px == pytest.approx(side, abs=1.0)
+    assert found.polarity == ("dark" if dark else "bright")
+
+
+def test_an_even_image_shows_nothing():
+    assert spots_in(np.full((50, 60), 7, dtype=np.uint8)) is None
