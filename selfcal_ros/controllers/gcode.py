@@ -171,10 +171,12 @@ class Rewriter:
                 self._refuse(f"{letter} is given twice", "keep one of them")
         if self._printer and letters[:1] not in ([], ["G"], ["M"]):
             self._refuse("the line does not begin with a command", remedy(letters[0]))
-        if "N" in letters[1:] or values.get("F", 1.0) <= 0 or (values.get("Q", 0.0) and any(
-                word.name == "G64" for word in words)):
-            self._refuse("N does not begin the line, the feed is not positive, or G64 has a Q that "
-                         "merges lines", "correct it; G64 needs Q0")
+        if "N" in letters[1:]:
+            self._refuse("N does not begin the line", "move it there")
+        if values.get("F", 1.0) <= 0:
+            self._refuse("the feed is not positive", "give one")
+        if values.get("Q") and any(word.name == "G64" for word in words):
+            self._refuse("G64 Q merges the pieces of corrected lines", "write Q0")
         return values
 
     def _code(self, word: Word) -> Code:

@@ -233,7 +233,7 @@ grbl | G21 // G1 X5 Y5 | 2: the program has not said G90 or G91
 grbl | G90 // G0 X5 Y5 | 2: the program has not said G20 or G21
 grbl | G21 G90 // G0 X5 Y5 // G2 X6 Y6 R4 | 3: the program has not said G17
 linuxcnc | G21 G90 // G0 X5 Y5 // G1 X6 | 3: the program has not said G61, G61.1 or G64
-linuxcnc | G64 P0.01 Q0.01 | 1: N does not begin
+linuxcnc | G64 P0.01 Q0.01 | 1: G64 Q merges
 grbl | G21 G90 // X5 | 2: the line does not name its command
 grbl | +G91 // G0 X5 | 5: the position before this line is not known
 grbl | +G90 // G0 X0 Y0 // G28 // G1 X5 | 7: the position before this line is not known
@@ -262,7 +262,7 @@ linuxcnc | +G1 X#1 Y0 | 4: 'X' does not
 linuxcnc | +G0 X[1+2] | 4: 'X' does not
 grbl | +G1 X1 X2 | 4: X is given twice
 grbl | +G0 G1 X1 | 4: G0 and G1 in one
-grbl | +G0 X0 Y0 // G1 X4 F0 | 5: N does not begin the line, the feed is not positive
+grbl | +G0 X0 Y0 // G1 X4 F0 | 5: the feed is not positive
 grbl | G0 X1 N5 | 1: N does not begin
 grbl | +G0 X1 0 | 4: '0' does not
 grbl | +G0 X1e3 | 4: E is not a word of G0
