@@ -6,7 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = "selfcal_ros"
 NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
-         "bag_player", "bag_recorder", "stage_simulator")
+         "bag_player", "bag_recorder", "cell_driver", "stage_simulator")
 
 
 VERBS = runpy.run_path(str(Path(NAME, "cli", "verbs.py")))

@@ -4,7 +4,7 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 
 from selfcal_ros.nodes.launching import arguments, foxglove, journal_argument, node, text
 
@@ -19,6 +19,10 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("detect", default_value="false", choices=["true", "false"],
                               description="find marks in stage/image as well"),
         node("mark_detector", condition=IfCondition(LaunchConfiguration("detect"))),
+        DeclareLaunchArgument("cell", default_value="", description="CELL.yaml of the machine that "
+                              "cell_driver drives; empty = a cell of your own"),
+        node("cell_driver", {"cell": text("cell")}, condition=IfCondition(
+            PythonExpression(["'", LaunchConfiguration("cell"), "' != ''"]))),
         node("measurement_collector", {"journal": text("journal")}),
         node("solver"),
         node("pose_sequencer", {"plan": text("plan")}),

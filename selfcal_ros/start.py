@@ -66,6 +66,6 @@ def _run(node: str) -> int | None:
 
 
 measurement_collector, pose_sequencer, solver, compensator, mark_detector, bag_player, \
-    bag_recorder, stage_simulator = (partial(_run, node) for node in (
+    bag_recorder, cell_driver, stage_simulator = (partial(_run, node) for node in (
         "measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
-        "bag_player", "bag_recorder", "stage_simulator"))
+        "bag_player", "bag_recorder", "cell_driver", "stage_simulator"))

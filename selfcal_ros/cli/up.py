@@ -11,6 +11,7 @@ from selfcal_ros.cli.processes import Supervisor, ended_by_signals, eyes, need_r
 from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
+from selfcal_ros.machine.cell import read_cell
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +31,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="publish corrected joint states as well")
     parser.add_argument("--detect", action="store_true",
                         help="find marks in stage/image as well (mark_detector in NODES.yaml)")
+    parser.add_argument("--cell", metavar="CELL.yaml", help="machine to be driven by cell_driver "
+                        "(docs/machines.md)")
     parser.add_argument("--simulate", action="store_true",
                         help="also run a simulated cell, to try it out")
 
@@ -72,6 +75,12 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
         nodes["mark_detector"] = with_parameters()
     if args.bag:
         nodes["bag_recorder"] = with_parameters(bag=str(Path(args.bag).absolute()))
+    if args.cell:
+        cell = read_cell(args.cell)
+        nodes["cell_driver"] = with_parameters(cell=str(cell.path.absolute()))
+        nodes["measurement_collector"] += ["-p", f"measurement_sense:={cell.sense}"]
+        if cell.placing == "robot":
+            nodes["pose_sequencer"] += ["-p", "auto_confirm:=true"]
     if args.simulate:
         nodes["stage_simulator"] = with_parameters()
     return nodes

@@ -69,7 +69,7 @@ EXAMPLES = {
     "call": "selfcal call start",
     "cell try": "selfcal cell try CELL.yaml",
     "cell check": "selfcal cell check --plan config/plans/hu.yaml",
-    "measure": "selfcal measure config/plans/hu_repeated.yaml config/cells/simulated.yaml "
+    "measure": "selfcal measure config/plans/small.yaml config/cells/simulated.yaml "
                "-o measured --yes",
     "camera init": "selfcal camera init bags/camera -o nodes.yaml --mark-size 72e-6 "
                    "--mark-pixels 12",

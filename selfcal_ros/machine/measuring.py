@@ -352,13 +352,14 @@ def collector_settings(cell: Cell) -> CollectorSettings:
     return CollectorSettings.checked({"measurement_sense": str(cell.sense)}, str(cell.path))
 
 
-def message_of(event: Command | EncoderSample | Detection) -> tuple[str, dict[str, Any]]:
+def message_of(event: Command | EncoderSample | Detection,
+               frame_id: str = FRAME) -> tuple[str, dict[str, Any]]:
     """Return topic and fields of a message of a cell."""
     if isinstance(event, Command):
-        return COMMAND_TOPIC, from_model.command(event, FRAME)
+        return COMMAND_TOPIC, from_model.command(event, frame_id)
     if isinstance(event, Detection):
-        return DETECTION_TOPIC, from_model.detection(event, FRAME)
-    return ENCODER_TOPIC, from_model.joint_state(event, FRAME)
+        return DETECTION_TOPIC, from_model.detection(event, frame_id)
+    return ENCODER_TOPIC, from_model.joint_state(event, frame_id)
 
 
 def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:

@@ -151,7 +151,6 @@ class Visitor:
         NoDataError
             If nothing is seen at the first stops.
         """
-        self.stopped = False
         route = stops(artifact, view, self.cell.sense, again=again, rng=self._rng)
         self.require(route)
         try:

@@ -33,7 +33,7 @@ from selfcal_ros.sessions.watching import Watch
 REQUESTS = {"start": "start", "confirm": "confirm_view", "redo": "redo_view",
             "skip": "skip_view", "abort": "abort"}
 WATCHED = ("measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
-           "bag_recorder", "stage_simulator", "bag_player")
+           "bag_recorder", "cell_driver", "stage_simulator", "bag_player")
 PERIOD_S = 0.2
 PATIENCE_S = 10.0
 

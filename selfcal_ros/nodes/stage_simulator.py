@@ -13,6 +13,7 @@ import numpy as np
 from selfcal_ros.collection import inputs
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
+from selfcal_ros.machine.duty import Duty
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes import names
@@ -31,8 +32,6 @@ LEAD_NS = 20_000_000
 of its view: no message is stamped in the past."""
 IMAGES_KEPT = 100
 """Images that wait for a slow detector."""
-PATIENCE_NS = 1_000_000_000
-"""Time after the last exposure from which a status includes all of them."""
 
 
 class StageSimulator(SelfcalNode[SimulatorSettings]):
@@ -59,8 +58,7 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._events: Iterator[Event | Exposure] = iter(())
         self._next: Event | Exposure | None = None
         self._idle_stamp = 0
-        self._command: inputs.Command | None = None  # the view that is being measured
-        self._acted: set[int] = set()  # stamps of commands
+        self._duty = Duty()
         self._free_ns = 0  # stamp from which it is idle
         self._encoder = self.publisher(names.ENCODER)
         self._detection = self.publisher(names.DETECTIONS)
@@ -78,33 +76,28 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)
-        if command.stamp_ns in self._acted:
-            return  # latched again by a restarted sequencer
-        self._acted.add(command.stamp_ns)
-        self._next, self._events, self._command = None, iter(()), None
-        if command.phase == inputs.Phase.MEASURE:
+        if not self._duty.take_command(command):
+            return
+        self._next, self._events = None, iter(())
+        if self._duty.command is not None:
             self._measure(command)
 
     def _on_status(self, message: Any) -> None:
         """Measure missing marks again after all have been measured."""
-        command = self._command
-        if (command is None or self._next is not None or message.complete
-                or message.view_index != command.view_index
-                or command.run_id not in ("", message.run_id)
-                or self.get_clock().now().nanoseconds < self._free_ns + PATIENCE_NS):
+        command = self._duty.command
+        if command is None or self._next is not None:
             return
-        missing = {*zip(message.missing_m, message.missing_n, strict=False), *message.missing_k}
+        again = self._duty.missing(message, self.get_clock().now().nanoseconds, self._free_ns)
         view = replace(command.placed(), repeats=1)
-        if message.check_done < message.check_expected:  # check stops, and all marks once more
+        if again.checks:  # check stops, and all marks once more
             self._measure(replace(command, view=view))
-        elif missing:
+        elif again:
             self._measure(replace(command, view=replace(view, check_marks=0, check_offset_m=0.0)),
-                          missing)
+                          {*again.marks, *again.lines})
 
     def _measure(self, command: inputs.Command, missing: Collection[object] = ()) -> None:
         """Measure the commanded view, of its marks those that are `missing`, if any."""
         inputs.check_simulated(command)
-        self._command = self._command or command
         plan = self._plan_with(command)
         if self.truth is None or self.truth.artifact != plan.artifact:
             count = max(64, len(plan.views), command.views_planned)

@@ -10,13 +10,13 @@ ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 SHARED = {"namespace", "params", "plan", "use_sim_time", "log_level", "foxglove"}
 ARGUMENTS = {
-    "calibrate.launch.py": SHARED | {"compensate", "detect", "journal"},
+    "calibrate.launch.py": SHARED | {"cell", "compensate", "detect", "journal"},
     "replay.launch.py": SHARED | {"bag", "rate"},
     "simulated_cell.launch.py": SHARED | {"bag", "camera", "journal"},
 }
 STARTED = {
     "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator",
-                            "mark_detector", "foxglove_bridge"},
+                            "mark_detector", "cell_driver", "foxglove_bridge"},
     "replay.launch.py": {"bag_player"},
     "simulated_cell.launch.py": {"bag_recorder", "stage_simulator"},
 }

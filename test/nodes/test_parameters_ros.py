@@ -11,6 +11,7 @@ from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.cell_driver import CellDriver
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -24,7 +25,8 @@ PARAMS = Path(__file__).parents[2] / "config" / "params"
 NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
          "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
          "mark_detector": MarkDetectorNode,
-         "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
+         "bag_recorder": BagRecorder, "cell_driver": CellDriver,
+         "stage_simulator": StageSimulator}
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +42,7 @@ def needed(files, tmp_path):
     return {"bag_player": {"bag": files["bag"]},
             "bag_recorder": {"bag": str(tmp_path / "recorded")},
             "mark_detector": DETECTS,
+            "cell_driver": {"cell": str(PARAMS.parent / "cells/simulated.yaml")},
             "pose_sequencer": {"plan": files["plan"]}}
 
 
@@ -61,7 +64,7 @@ def test_every_parameter_is_described_bounded_and_has_its_default(graph, needed,
         assert [(r.from_value, r.to_value) for r in ranges] == expected
         if parameter.name not in needed.get(name, {}):
             assert node.get_parameter(parameter.name).value == parameter.default
-    if name == "bag_recorder":
+    if name in ("bag_recorder", "cell_driver"):
         node.close()
 
 
@@ -102,7 +105,7 @@ def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
         "--ros-args", "--params-file", str(file), *more]))
     for key, value in stated.items():
         assert node.get_parameter(key).value == value
-    if name == "bag_recorder":
+    if name in ("bag_recorder", "cell_driver"):
         node.close()
 
 

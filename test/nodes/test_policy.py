@@ -10,6 +10,7 @@ import pytest
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
+from selfcal_ros.nodes.cell_driver import CellDriver
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
@@ -24,7 +25,9 @@ POLICY = ElementTree.parse(Path(__file__).parents[2] / "config/sros2/policy.xml"
 NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
          "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
          "mark_detector": MarkDetectorNode,
-         "bag_recorder": BagRecorder, "stage_simulator": StageSimulator}
+         "bag_recorder": BagRecorder, "cell_driver": CellDriver,
+         "stage_simulator": StageSimulator}
+SIMULATED_CELL = Path(__file__).parents[2] / "config/cells/simulated.yaml"
 KINDS = (("topics", "publish"), ("topics", "subscribe"), ("services", "reply"),
          ("services", "request"), ("actions", "execute"))
 
@@ -73,6 +76,7 @@ def test_a_node_is_granted_what_it_does_and_nothing_else(graph, tmp_path, name):
     parameters = {"bag_player": {"bag": str(small_bag(tmp_path)), "rate": 0.001},
                   "bag_recorder": {"bag": str(tmp_path / "new")},
                   "mark_detector": DETECTS,
+                  "cell_driver": {"cell": str(SIMULATED_CELL)},
                   "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
     camera(graph)

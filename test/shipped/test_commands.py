@@ -49,7 +49,7 @@ def test_commands_are_understood(page):
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
     """Go to a folder with what the repository has at its root, and a result."""
-    for name in ("config", "bags"):
+    for name in ("config", "bags", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path

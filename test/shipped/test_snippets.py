@@ -8,7 +8,13 @@ import subprocess
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.cli.main import main
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.machine import Machine, MachineError
+from selfcal_ros.machine.measuring import Run
+from test.support.cells import CELL, Agreeing, Jumping, write_cell
 from test.support.pages import PAGES, ROOT, lines_of
 from test.support.sessions import collected, events_of, small_plan
 
@@ -35,7 +41,38 @@ def run(tmp_path, monkeypatch):
 
 def test_every_page_with_python_is_run_here():
     assert {page.name for page in PAGES if "```python" in page.read_text()} == {
-        "apply.md", "bags.md", "cal.md", "estimation.md"}
+        "apply.md", "bags.md", "cal.md", "estimation.md", "machines.md"}
+
+
+def test_machines(run, tmp_path):
+    """The class of the page, around a driver in mm, measures a plan to its true map."""
+    cell, simulated = write_cell(tmp_path, camera=True, cell=CELL + "origin: {x: 0.0}\n")
+
+    class Driver:
+        def read_mm(self, letter):
+            return 1e3 * simulated.position()["XY".index(letter)]
+
+        def move_mm(self, x, y):
+            simulated.move_to((x / 1e3, y / 1e3, 0.0))
+            return x < 0.0005  # a fault of the drive at the last column
+
+        def snap(self):
+            return simulated.image().pixels
+
+        def stop(self):
+            self.stopped = True
+
+        def close(self):
+            pass
+
+    machine = run("machines.md", connect=lambda port: Driver())["Stage"]("COM3")
+    machine.place = simulated.place
+    assert isinstance(machine, Machine)
+    measuring = Run(read_plan("plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(), Jumping())
+    with pytest.raises(MachineError, match="stage: the drive reports an error; reset it"):
+        measuring.measure()
+    assert machine._driver.stopped
+    assert collect_bag(tmp_path / "bag", CollectorSettings()).measurements.views[0].count.sum() > 5
 
 
 def test_estimation(run):

@@ -254,6 +254,15 @@ class RecorderSettings(Settings):
 
 
 @dataclass(frozen=True)
+class DriverSettings(Settings):
+    """The machine that cell_driver drives."""
+
+    NODE: ClassVar[str] = "cell_driver"
+    frame_id: str = _frame()
+    cell: str = declared("", "path of CELL.yaml (docs/machines.md)")
+
+
+@dataclass(frozen=True)
 class SimulatorSettings(Settings):
     """The cell of stage_simulator, by the keys of SIM.yaml (docs/simulate.md)."""
 
@@ -353,7 +362,8 @@ class SimulatorSettings(Settings):
 
 NODE_SETTINGS: dict[str, type[Settings]] = {kind.NODE: kind for kind in (
     CollectorSettings, SolverSettings, SequencerSettings, CompensatorSettings,
-    DetectorSettings, PlayerSettings, RecorderSettings, SimulatorSettings)}
+    DetectorSettings, PlayerSettings, RecorderSettings, DriverSettings,
+    SimulatorSettings)}
 NODE_PARAMETERS: dict[str, tuple[Parameter, ...]] = {
     node: kind.parameters() for node, kind in NODE_SETTINGS.items()}
 
