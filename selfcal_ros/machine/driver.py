@@ -11,10 +11,10 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.errors import SelfcalError
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
-from selfcal_ros.machine.duty import Duty
+from selfcal_ros.machine.duty import Again, Duty
 from selfcal_ros.machine.interface import Machine, Placing
 from selfcal_ros.machine.measuring import place_by_robot
-from selfcal_ros.machine.visiting import Again, Visitor, stops
+from selfcal_ros.machine.visiting import Visitor, stops
 
 IDLE_S = 0.05
 """Time between two readings of the position while nothing is to be done."""

@@ -1,14 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a cell under ROS has to do: which commands are new, which marks have to be seen again."""
 
+from collections.abc import Collection
+from dataclasses import dataclass
 from typing import Any
 
 from selfcal_ros.collection.inputs import Command, Phase
-from selfcal_ros.machine.visiting import Again
 from selfcal_ros.units import NS_PER_S
 
 PATIENCE_NS = NS_PER_S
 """Time after the last exposure from which a status includes all of them."""
+
+
+@dataclass(frozen=True)
+class Again:
+    """What is still missing of a view: marks (m, n), lines k, check stops."""
+
+    marks: Collection[tuple[int, int]] = ()
+    lines: Collection[int] = ()
+    checks: bool = False
+
+    def __bool__(self) -> bool:
+        """Return whether anything is missing."""
+        return bool(self.marks or self.lines or self.checks)
 
 
 class Duty:

@@ -27,8 +27,9 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
+from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
-from selfcal_ros.machine.visiting import Again, Visitor, stops
+from selfcal_ros.machine.visiting import Visitor, stops
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import placing_digest
 from selfcal_ros.model.view import Plan

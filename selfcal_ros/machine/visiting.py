@@ -6,7 +6,7 @@ as commanded stops the machine and raises `MachineError`.
 """
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
+from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Image, Machine, MachineError, Offset
 from selfcal_ros.machine.seeing import Eye
 from selfcal_ros.model.artifact import Artifact
@@ -57,19 +58,6 @@ class Stop:
     target: Position
     kind: Kind
     exposures: int = 1
-
-
-@dataclass(frozen=True)
-class Again:
-    """What is still missing of a view: marks (m, n), lines k, check stops."""
-
-    marks: Collection[tuple[int, int]] = ()
-    lines: Collection[int] = ()
-    checks: bool = False
-
-    def __bool__(self) -> bool:
-        """Return whether anything is missing."""
-        return bool(self.marks or self.lines or self.checks)
 
 
 def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None = None,
