@@ -2,8 +2,8 @@
 """`make chaos`: cells whose messages are lost, doubled and late, and whose nodes are killed.
 
 In each round, of its own seed, two cells run side by side, then one whose disk is full for a while,
-one whose sequencers are killed, and one in which a run was stamped a day ahead before: see
-`test.support.chaos`.
+one whose sequencers are killed, one in which a run was stamped a day ahead before, and one among
+strangers who would harm: see `test.support.chaos`.
 
     make chaos [ROUNDS=10] [SEED=1]
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from selfcal_ros.cli.processes import domain
-from test.support.chaos import clock_ahead, full_disk, killed_sequencers, one_round
+from test.support.chaos import attacked, clock_ahead, full_disk, killed_sequencers, one_round
 
 
 def main() -> int:
@@ -34,7 +34,7 @@ def main() -> int:
             place = Path(folder, str(seed))
             place.mkdir()
             lines, wrong = one_round(seed, environment, place)
-            for other in (full_disk, killed_sequencers, clock_ahead):
+            for other in (full_disk, killed_sequencers, clock_ahead, attacked):
                 line, faults = other(seed, environment, place)
                 lines.append(f"{other.__name__}: {line}")
                 wrong += [f"{other.__name__}: {fault}" for fault in faults]

@@ -10,6 +10,7 @@ from selfcal_ros.collection.inputs import Detection
 from test.support.chaos import (
     HARMLESS,
     STEPS_S,
+    attacked,
     clock_ahead,
     faults_of,
     full_disk,
@@ -46,6 +47,13 @@ def test_a_run_whose_sequencers_are_killed_is_taken_up_in_its_view(
 def test_a_run_after_one_that_was_stamped_a_day_ahead_is_as_if_that_had_not_been(
         ros_environment, tmp_path, forks):
     line, wrong = clock_ahead(4, ros_environment, tmp_path, kills=1, forks=forks)
+    assert wrong == []
+    assert " used + " in line
+
+
+def test_a_cell_among_strangers_who_would_harm_gives_the_map_of_the_undisturbed_run(
+        ros_environment, tmp_path, forks):
+    line, wrong = attacked(5, ros_environment, tmp_path, forks=forks)
     assert wrong == []
     assert " used + " in line
 

@@ -7,38 +7,63 @@ its nodes were there. Collectors and solvers are killed (SIGKILL) at random mome
 started again. Every detection that was sent must be used, or rejected by reason; the map must be
 the one of the same messages in a quiet process and, in the first cell, that of the undisturbed
 run, bit for bit. The disk of a third cell is full for a while; in a fourth one, which follows
-commands, sequencers are killed; in a fifth a run was stamped a day ahead before.
+commands, sequencers are killed; in a fifth a run was stamped a day ahead before. In a sixth,
+strangers publish maps that would harm, images that would start a program or fill the memory, and
+play a bag; another recorder writes beside the journals, and the disk has no space for the result.
 """
 
 import contextlib
+import io
+import math
 import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 from rclpy.node import Node
 from selfcal_msgs.msg import ViewCommand
 from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import Detection
+from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.errors import ExitCode, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.files import read_json
+from selfcal_ros.messages import from_model
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.bag_player import BagPlayer
+from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.filling import fill
+from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Faults, apply_faults
+from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S
+from test.support.cameras import DETECTS
 from test.support.forked import Forks
 from test.support.independent_cell import IndependentCell, largest_deviation
 from test.support.killed import Cell
+from test.support.maps import random_map, result_of
 from test.support.ros import Graph
-from test.support.sessions import collected, decoded, events_of, plan_file, small_plan
+from test.support.sessions import (
+    cdr_of,
+    collected,
+    decoded,
+    events_of,
+    plan_file,
+    small_bag,
+    small_plan,
+)
 
 HARMLESS = Faults(duplicated=0.05, delay_s=0.05)
 HARMFUL = Faults(lost=0.05, duplicated=0.05, outliers=0.03, low_score=0.02, not_finite=0.02,
@@ -315,6 +340,119 @@ def clock_ahead(seed: int, environment: dict, folder: Path, *, kills: int = 3,
     finally:
         cell.close()
         graph.close()
+
+
+SMALL = 4000
+"""Bytes to which files of a solver are limited for a while: less than a result has."""
+HARMFUL_VALUES = {"gx": (math.nan, math.inf, 2e-3), "g_theta": (math.inf, 0.5)}
+"""What maps of strangers have where they are stated to be known, m and rad."""
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 99 99\n%%EndComments\nshowpage\n%%EOF\n"
+BOMB_SIDE = 8000
+"""Pixels of the side of an image of some kB."""
+
+
+def attacked(seed: int, environment: dict, folder: Path, *, forks: Forks | None = None,
+             ) -> tuple[str, list[str]]:
+    """Measure in a cell among strangers whose messages and files would harm.
+
+    The map is that of the undisturbed run, the compensator corrects by no other, the recording
+    beside the journals is as it was, and the result is written once there is space.
+    """
+    rng, place = np.random.default_rng(seed), folder / "attacked"
+    recording = place / "attacked" / "recording"
+    recording.parent.mkdir(parents=True)
+    graph = Graph(int(environment["ROS_DOMAIN_ID"]))
+    cell = Cell(graph, environment, place, "attacked", forks=forks)
+    try:
+        one = story(cell, HARMLESS, rng, 0)
+        before = _recorded(recording, one.measured)
+        saved = place / "by_itself.json"
+        cell.start("solver", result_folder=place, save_path=saved)
+        cell.start_collector()
+        compensator = graph.node(partial(CompensatorNode, namespace=cell.namespace),
+                                 require_qualified=False)
+        cell.limit_files("solver", SMALL)
+        one.play_to(rng.uniform(0.3, 0.5))
+        _harm(cell, compensator, one.measured, seed)
+        _show_images(cell, one.faults)
+        _play(cell, place, one.faults)
+        one.play_to(1.0)
+        if "cannot be written" not in str(cell.saved()) or saved.exists():
+            one.faults.append("a result was written on a full disk")
+        cell.limit_files("solver", resource.RLIM_INFINITY)
+        graph.until(saved.exists, "the result on a disk that has space")
+        line = one.judge()
+        gx = np.array(read_json(saved)["error_map"]["gx"], dtype=float)
+        graph.until(lambda: compensator.session.compensator is not None and np.array_equal(
+            compensator.session.compensator.error_map.gx, gx), "the map in the compensator")
+        if {file: file.read_bytes() for file in recording.iterdir()} != before:
+            one.faults.append("the recording beside the journals has changed")
+        return line, one.faults
+    finally:
+        cell.close()
+        graph.close()
+
+
+def _recorded(folder: Path, events: list[Event]) -> dict[Path, bytes]:
+    """Return the files of a recording of an unfinished run, as a recorder has written them."""
+    with BagWriter(folder) as writer:
+        for topic, kind in INPUT_TOPICS.items():
+            writer.add_topic(f"/{topic}", kind, [])
+        command = next(event for event in events if isinstance(event, Command))
+        writer.write_raw(f"/{names.COMMAND.name}", cdr_of(command), command.stamp_ns)
+    return {file: file.read_bytes() for file in folder.iterdir()}
+
+
+def _speak(cell: Cell, topic: names.Topic) -> Any:
+    """Return a publisher of a stranger, once it is heard."""
+    publisher = cell.graph.hand.create_publisher(topic.type, cell.name(topic.name), topic.qos)
+    cell.graph.until(publisher.get_subscription_count, topic.name)
+    return publisher
+
+
+def _harm(cell: Cell, compensator: CompensatorNode, events: list[Event], seed: int) -> None:
+    """Publish maps that would harm; each of them is refused."""
+    publisher, refused = _speak(cell, names.ERROR_MAP), compensator.refusals.counts
+    plate = next(event.artifact for event in events if isinstance(event, Command))
+    good = from_model.error_map(result_of(random_map(plate, seed)), events[-1].stamp_ns, "stage")
+    for name, values in HARMFUL_VALUES.items():
+        for value in values:
+            count = refused[names.ERROR_MAP.name]
+            spoilt = np.append(good[name][:-1], value)
+            publisher.publish(fill(names.ERROR_MAP.type(), good | {"qualified": True,
+                                                                   name: spoilt}))
+            cell.graph.until(lambda count=count: refused[names.ERROR_MAP.name] > count,
+                             f"the refusal of {value} in {name}")
+    cell.graph.hand.destroy_publisher(publisher)
+
+
+def _show_images(cell: Cell, faults: list[str]) -> None:
+    """Publish images that must not be decoded; a detector refuses both, and lives."""
+    detector = cell.graph.node(partial(MarkDetectorNode, namespace=cell.namespace),
+                               **DETECTS, transport="compressed")
+    topic = names.image_topics("compressed", 10)[0]
+    publisher, bomb = _speak(cell, topic), io.BytesIO()
+    Image.new("1", (BOMB_SIDE, BOMB_SIDE)).save(bomb, "PNG")
+    for number, data in enumerate((EPS, bomb.getvalue())):
+        image = topic.type(format="png", data=data)
+        image.header.stamp.sec = number + 1
+        publisher.publish(image)
+    cell.graph.until(lambda: detector.refusals.counts[topic.name] == 2, "the refusals")
+    if detector.diagnose_session().values["images"]:
+        faults.append("an image was used that must not be decoded")
+    cell.graph.hand.destroy_publisher(publisher)
+    cell.graph.remove(detector)
+
+
+def _play(cell: Cell, folder: Path, faults: list[str]) -> None:
+    """Have a player start in the cell, whose stage publishes: it plays nothing."""
+    (folder / "other").mkdir()
+    player = cell.graph.node(partial(BagPlayer, namespace=cell.namespace), rate=0.0,
+                             bag=str(small_bag(folder / "other")))
+    cell.graph.until(player.finished.done, "the end of the player")
+    if (player.exit_code, player.player.played) != (ExitCode.BAD_INPUT, 0):
+        faults.append(f"{player.player.played} messages were played into the cell")
+    cell.graph.remove(player)
 
 
 def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str, list[str]]:
