@@ -11,6 +11,7 @@ from selfcal_ros.collection.clock_steps import Step, StepWatch
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.topics import DETECTION_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 LIVE_NS = NS_PER_S
@@ -23,8 +24,9 @@ class ClockWatch:
     """Compare the stamps of the cell with the reception of its messages.
 
     A message arrives after its stamp, by an unknown delay; the smallest delay of the last seconds
-    is the offset of the cell's clock, to within the transport delay. There is no report while
-    recorded messages are played: the commands then have stamps of the past as well.
+    is the offset of the cell's clock, to within the transport delay. A detection comes later by the
+    time that its image took, so that detections alone show no clock that is behind. There is no
+    report while recorded messages are played: the commands then have stamps of the past as well.
 
     Steps are detected with a steady clock, including those of this machine's own clock.
 
@@ -71,6 +73,8 @@ class ClockWatch:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
             self.steps.setdefault(topic, []).extend(watch.add(stamps_ns, steady_ns))
         offset, now_s = int((stamps_ns - now_ns).max()), float(steady_ns[-1]) * S_PER_NS
+        if topic == DETECTION_TOPIC and offset < 0:
+            return
         if self._bins and now_s - self._bins[-1][0] < BIN_S:
             when, largest = self._bins[-1]
             self._bins[-1] = (when, max(largest, offset))

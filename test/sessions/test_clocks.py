@@ -6,6 +6,7 @@ import pytest
 
 from selfcal_ros.sessions.clocks import ClockWatch, RosTime
 from selfcal_ros.sessions.health import Level
+from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 
 NOTHING = ("use_sim_time is set but nothing is received on /clock: this node stamps everything "
            "0; play the bag with --clock, or start the node without use_sim_time")
@@ -59,6 +60,18 @@ def test_an_offset_is_named_beyond_its_limit_in_either_direction(offset_s, messa
     assert found.level == (Level.WARN if message else Level.OK)
     assert found.values == {"clock_offset_s": f"{offset_s:.3f}"}
     assert watch.ahead == (offset_s > 0.05)
+
+
+@pytest.mark.parametrize("lead_s, offset_s", [(-0.645, None), (0.645, 0.645)])
+def test_a_slow_image_is_no_clock_that_is_behind(lead_s, offset_s):
+    watch, now = ClockWatch(limit_s=0.1), [T0]
+    watch.command(T0, T0, is_older=False)
+    stamps = np.array([T0 + round(lead_s * 1e9)])
+    watch.data(DETECTION_TOPIC, stamps, np.array(now), np.array([50 * 10**9]))
+    assert watch.offset_ns == (offset_s and round(offset_s * 1e9))
+    assert bool(watch.diagnosis().message) is (offset_s is not None)
+    watch.data(ENCODER_TOPIC, np.array([T0 - 10**6]), np.array(now), np.array([50 * 10**9]))
+    assert watch.offset_ns == max(-10**6, round((offset_s or -1.0) * 1e9))
 
 
 def test_the_clock_of_the_system_is_no_matter():
