@@ -4,6 +4,7 @@
 import argparse
 import contextlib
 import os
+import re
 from pathlib import Path
 
 from selfcal_ros.cli.monitor import watch
@@ -12,6 +13,9 @@ from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import read_cell
+
+MOST_OF_A_NAME = 200
+"""Characters of the name of a folder, below the limit of file systems."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -25,8 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "save_map (default: the working directory)")
     add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
     parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
-                        "restarted collector continues (default: journals in the folder of the "
-                        "results; with --simulate journals_simulated)")
+                        "restarted collector continues (default: one for each folder of results, "
+                        "in selfcal of the user's folder for states, ~/.local/state)")
     parser.add_argument("--compensate", action="store_true",
                         help="publish corrected joint states as well")
     parser.add_argument("--detect", action="store_true",
@@ -52,6 +56,22 @@ def run(args: argparse.Namespace) -> int:
         return watch(monitor, supervisor.log, supervisor.step, as_json=args.json)
 
 
+def state_folder(results: str) -> Path:
+    """Return the folder for the journals of runs whose maps go to `results`.
+
+    Raises
+    ------
+    InputError
+        If the user has no folder for states.
+    """
+    state, home = os.environ.get("XDG_STATE_HOME"), os.environ.get("HOME")
+    if not state and not home:
+        raise InputError("HOME", "is not set, and journals are kept there",
+                         "set it, or give --journal FOLDER")
+    name = re.sub(r"[^\w.-]", "_", str(Path(results).absolute()).strip("/")) or "root"
+    return Path(state or Path(home or "", ".local/state"), "selfcal", name[-MOST_OF_A_NAME:])
+
+
 def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     """Return node -> its arguments."""
     common = ros_arguments(args)
@@ -61,7 +81,7 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
                          for word in ("-p", f"{name}:={value}")]
     # separate: an interrupted simulated run must never continue with real readings
     folder = "journals_simulated" if args.simulate else "journals"
-    journal = args.journal or str(Path(args.results, folder))
+    journal = args.journal or str(state_folder(args.results) / folder)
     of = "_simulated" if args.simulate else ""
     # first, so that a parameter file can override it
     saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")

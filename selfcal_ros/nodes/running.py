@@ -4,6 +4,7 @@
 import ctypes
 import faulthandler
 import gc
+import os
 import re
 import signal
 import socket
@@ -50,7 +51,14 @@ def spin(node: Guarded, until: Future) -> None:
         executor.shutdown()
 
 
+LOG_FOLDERS = ("HOME", "ROS_HOME", "ROS_LOG_DIR")
+"""Variables of the environment of which one must name where ROS keeps its log."""
+
+
 def _init(argv: list[str] | None) -> None:
+    if not any(map(os.environ.get, LOG_FOLDERS)):
+        raise InputError("HOME", "is not set, and ROS keeps its log there",
+                         "set it, or ROS_LOG_DIR")
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:

@@ -3,10 +3,13 @@
 
 import gc
 import os
+import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from test.support.shared_memory import OLD_S, SHARED, remove_stale
 
 HERE = f"{Path(__file__).parent}{os.sep}"
 MISSING = [name for name in ("rclpy", "selfcal_msgs") if find_spec(name) is None]
@@ -53,6 +56,12 @@ def graph(ros_environment):
     graph = Graph(int(ros_environment["ROS_DOMAIN_ID"]))
     yield graph
     graph.close()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_stale_segments():
+    """Remove the shared memory that killed nodes have left, of this run or an earlier one."""
+    remove_stale(SHARED, time.time() - OLD_S)
 
 
 @pytest.fixture(autouse=not MISSING)

@@ -2,6 +2,7 @@
 """Each node as a process: it starts, a signal ends it with code 0, and nothing stays behind."""
 
 import contextlib
+import fcntl
 import os
 import signal
 import socket
@@ -17,8 +18,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from selfcal_ros.cli import processes
 from selfcal_ros.cli.replay import NODES
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.nodes import running
 from test.support.forked import Fork, Forks
 from test.support.sessions import plan_file, small_bag, small_plan
+from test.support.shared_memory import remove_stale
 from test.support.waiting import PATIENCE_S, wait_until
 
 SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
@@ -306,3 +309,25 @@ def test_a_domain_that_somebody_uses_is_left_to_him():
         participant.bind(("", 7400 + 250 * free + 10))
         with processes.domain() as environment:
             assert int(environment["ROS_DOMAIN_ID"]) != free
+
+
+def test_a_node_without_a_home_says_so(monkeypatch, capsys):
+    for name in running.LOG_FOLDERS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(running, "complete_on_signal", lambda _: None)
+    monkeypatch.setattr(running, "ignore_signals", lambda: None)
+    assert running.run(lambda: pytest.fail("made"), []) == 2
+    assert capsys.readouterr().err == ("selfcal: HOME: is not set, and ROS keeps its log there; "
+                                       "set it, or ROS_LOG_DIR\n")
+
+
+def test_shared_memory_of_nodes_that_are_gone_is_removed_and_no_other(tmp_path):
+    for name in ("fastrtps_1", "fastrtps_1_el", "fastrtps_port7", "fastrtps_port7_el",
+                 "sem.fastrtps_port7_mutex", "fastrtps_2", "fastrtps_2_el", "other_el"):
+        (tmp_path / name).touch()
+    with (tmp_path / "fastrtps_2_el").open("rb") as alive:
+        fcntl.flock(alive, fcntl.LOCK_EX)
+        remove_stale(tmp_path, 0.0)
+        assert len(list(tmp_path.iterdir())) == 8
+        remove_stale(tmp_path, time.time() + 60.0)
+    assert {file.name for file in tmp_path.iterdir()} == {"fastrtps_2", "fastrtps_2_el", "other_el"}

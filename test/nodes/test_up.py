@@ -22,6 +22,7 @@ from selfcal_ros.cli import up as up_verb
 from selfcal_ros.cli.main import build_parser
 from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.cli.processes import MOST_RESTARTS, Supervisor
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import monitor_session
 from test.support.sessions import plan_file, small_plan
@@ -201,13 +202,27 @@ def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
 
 
 @pytest.mark.parametrize(("words", "folder"), [
-    ([], "journals"), (["--simulate"], "journals_simulated"), (["--journal", "own"], "own"),
+    ([], "state/selfcal/HERE/journals"), (["--simulate"], "state/selfcal/HERE/journals_simulated"),
+    (["--results", "other"], "state/selfcal/HERE_other/journals"), (["--journal", "own"], "own"),
     (["--simulate", "--journal", "own"], "own")])
 def test_a_simulated_run_keeps_its_journals_apart(tmp_path, monkeypatch, words, folder):
+    """Those of each folder of results, in none that the user works in."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     args = build_parser().parse_args(["up", "--plan", "p.yaml", *words])
     given = up_verb.commands(args)["measurement_collector"]
-    assert given[-2:] == ["-p", f"journal:={tmp_path / folder}"]
+    here = str(tmp_path).strip("/").replace("/", "_")
+    assert given[-2:] == ["-p", f"journal:={tmp_path / folder.replace('HERE', here)}"]
+
+
+def test_states_without_a_home_are_asked_for(monkeypatch):
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.setenv("HOME", "/home/me")
+    assert str(up_verb.state_folder("/data")) == "/home/me/.local/state/selfcal/data"
+    monkeypatch.delenv("HOME")
+    with pytest.raises(InputError, match="HOME: is not set, and journals are kept there; set it, "
+                                         "or give --journal FOLDER"):
+        up_verb.state_folder("/data")
 
 
 def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
