@@ -349,7 +349,8 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     u_theta = np.full(system.angular.n_lines, np.nan)
     if cover is not None:
         u = float(np.sqrt(cover.variance_of_scale(alone))) * sigma / length
-    if cover is not None and math.isfinite(u):
+    # the plate's covariance takes a factor of its own, as large as that of the stage
+    if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
         if system.grid.n_sites <= MAX_SITES and isinstance(system.grid.views, LatticeViews):
             variance = variance + image_variances(model, cover, plate=True)
