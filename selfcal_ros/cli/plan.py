@@ -33,7 +33,7 @@ from selfcal_ros.files import write_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, in_order, parse_terms
 from selfcal_ros.model.view import Plan, parse_order
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.summary.numbers import counted
@@ -143,7 +143,7 @@ def _repeated(plan: Plan, repeats: int | None) -> Plan:
 
 
 def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
-           sizes: dict[TermName, float], without: tuple[Observability, Prediction],
+           sizes: dict[str, float], without: tuple[Observability, Prediction],
            ) -> tuple[Observability, Prediction | None, Sequence[TermCheck]]:
     """Return observability and prediction with terms, and the checks of the terms.
 
@@ -322,7 +322,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
     found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
     found |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
-    named = tuple(found[n] for n in TermName if n in found)
+    named = in_order(found.values())
     by_default = plan_terms.assumed_terms(args.against, named, plan)
     return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 

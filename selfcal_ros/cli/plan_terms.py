@@ -9,16 +9,17 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.observability.plan_budget import PlanBudget
 from selfcal_ros.estimation.observability.resistance import TermCheck
 from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, Assumed
 from selfcal_ros.model.terms import (
-    DEFAULT_TERMS,
     DRIFT_DEGREE,
     MAX_DRIFT_DEGREE,
     ModelTerm,
-    TermName,
+    default_terms,
+    in_order,
     parse_terms,
 )
 from selfcal_ros.model.view import DEFAULT_ORDER, Plan, parse_order
@@ -107,7 +108,7 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
                    length_m(args.stage_error, "--stage-error"))
 
 
-def sizes_of(args: argparse.Namespace) -> dict[TermName, float]:
+def sizes_of(args: argparse.Namespace) -> dict[str, float]:
     """Return the sizes that ``--against`` gives, by term.
 
     Raises
@@ -129,7 +130,7 @@ def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
         return ()
     found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
                                            parse_terms(args.model, "--model")) for term in terms}
-    return tuple(found[name] for name in TermName if name in found and found[name].size > 0)
+    return tuple(term for term in in_order(found.values()) if term.size > 0)
 
 
 def _is_none(given: list[str]) -> bool:
@@ -154,9 +155,10 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    names = {term.name for term in named} | ({TermName.MICROSCOPE} if tells_camera(plan) else set())
+    names = {term.name for term in named} | ({
+        block.name for block in blocks().values() if block.of_offsets and tells_camera(plan)})
     return () if _is_none(given) else tuple(
-        term for term in DEFAULT_TERMS if term.name not in names)
+        term for term in default_terms() if term.name not in names)
 
 
 def tells_camera(plan: Plan) -> bool:
@@ -212,7 +214,7 @@ def size_text(check: TermCheck) -> str:
     """Return the size of a term in a person's unit."""
     if check.unit == "m":
         return f"{check.size * UM_PER_M:.6g} µm"
-    if check.name is TermName.PLATE_SCALE:
+    if block_of(check.name).of_plate:
         return f"{check.size * UM_PER_M:.6g} µm/m"
     return f"{check.size * MRAD_PER_RAD:.6g} mrad"
 

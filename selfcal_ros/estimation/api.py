@@ -27,7 +27,7 @@ from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import TermName, microscope_term
+from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
@@ -77,7 +77,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         (scale, turn), other = camera.u_coefficients[1:3]
         known = microscope_term(float(scale), float(turn), float(other.max()))
         options = replace(options, assumed=tuple(
-            known if term.name is TermName.MICROSCOPE else term for term in options.assumed))
+            known if term.block.of_offsets else term for term in options.assumed))
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
     solved = judged(solved, measurements, options)
     result = solved.result
@@ -152,7 +152,7 @@ def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None
     if options.method == "law" or not measurements.has_images:
         return None, measurements
     plain = replace(options, terms=(), assumed=tuple(
-        term for term in options.model_terms(visits=True) if term.name is TermName.YAW))
+        term for term in options.model_terms(visits=True) if term.block.of_images))
     for _ in range(CAMERA_STEPS):
         camera = camera_of(measurements, fit_joint(straight, plain))
         if camera is None:

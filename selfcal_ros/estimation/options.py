@@ -2,7 +2,7 @@
 """How to calibrate: method, datum, reference length, model of the misalignments."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError, check_celsius, known_are
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import DEFAULT_TERMS, DRIFT_DEGREE, VISIT_TERMS, ModelTerm
+from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, default_terms
 
 METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
@@ -224,7 +224,7 @@ class Options:
     drift_degree: int = DRIFT_DEGREE
     causes: bool | None = None
     terms_from: str = ""
-    assumed: tuple[ModelTerm, ...] = DEFAULT_TERMS
+    assumed: tuple[ModelTerm, ...] = field(default_factory=default_terms)
     at_places: bool = True
     magnification_limit: float = 1e-4
     robust: bool = False
@@ -269,5 +269,5 @@ class Options:
         """
         named = {term.name for term in self.terms}
         more = [term for term in self.assumed if assumed and term.name not in named
-                and (visits or term.name not in VISIT_TERMS)]
+                and (visits or not term.block.needs_visits)]
         return tuple(term for term in (*self.terms, *more) if term.size > 0)

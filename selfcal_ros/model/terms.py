@@ -4,8 +4,9 @@
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from enum import StrEnum
+from functools import cache
 
+from selfcal_ros.blocks import Block, block_of, blocks
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import checked_fields
 
@@ -19,72 +20,19 @@ SMALLEST, LARGEST = 1e-18, 1.0
 """Valid sizes of terms in texts."""
 
 
-class TermName(StrEnum):
-    """Names of the terms, as in ``--model``, ``model_terms`` and RESULT.json.
-
-    MICROSCOPE: a 2x2 matrix E shared by all views, mark = indicated + (1 + E) offset.
-    DRIFT: the plate moves relative to the stage during a view, a polynomial of time.
-    PLATE_SCALE: the plate is larger by a factor 1 + b in a view (temperature).
-    PLATE_SHAPE: the plate is bent in a view, quadratic in position (clamping, gravity).
-    APPROACH: the indicated position depends on the direction from which an axis arrived.
-    PLATE_STRAIN: the plate is strained linearly in a view (clamping): scale, stretch and shear.
-    LINE_ECCENTRICITY: the circle of lines is eccentric to the axis of rotation, differently in each
-    view, as a fraction of its radius.
-    ROTATION: the plate turns between the marks and the lines of a view.
-    YAW: the stage turns, by another angle at each site; only marks off the optical axis show it.
-    """
-
-    MICROSCOPE = "microscope"
-    DRIFT = "drift"
-    PLATE_SCALE = "plate_scale"
-    PLATE_SHAPE = "plate_shape"
-    APPROACH = "approach"
-    PLATE_STRAIN = "plate_strain"
-    LINE_ECCENTRICITY = "line_eccentricity"
-    ROTATION = "rotation"
-    YAW = "yaw"
-
-
-VISIT_TERMS = frozenset({TermName.MICROSCOPE, TermName.DRIFT, TermName.APPROACH})
-"""Terms that need instant, offset or approach of each reading."""
-
-UNITS: dict[str, str] = {
-    TermName.MICROSCOPE: "m/m", TermName.DRIFT: "m", TermName.PLATE_SCALE: "m/m",
-    TermName.PLATE_SHAPE: "m", TermName.APPROACH: "m", TermName.PLATE_STRAIN: "m/m",
-    TermName.LINE_ECCENTRICITY: "rad", TermName.ROTATION: "rad", TermName.YAW: "rad"}
-"""Unit of each term's size: a standard deviation known from elsewhere. For a drift it is that at
-the edge of the view's time, for a shape at the middle of the plate's edge."""
-
-NOMINAL_SIZES = {
-    TermName.MICROSCOPE: 1e-3, TermName.DRIFT: 10e-9, TermName.PLATE_SCALE: 1e-6,
-    TermName.PLATE_SHAPE: 10e-9, TermName.APPROACH: 10e-9, TermName.PLATE_STRAIN: 1e-6}
-"""Sizes for which the effect of a term outside the model is stated: 1 mrad and 0.1 %, 10 nm,
-1 um/m. Terms of the marks only: lines do not affect the XY map."""
-
-OF_PLATE = (TermName.PLATE_SCALE, TermName.PLATE_SHAPE, TermName.PLATE_STRAIN)
-"""Terms of the plate itself, which differ between views and turn with it."""
-
-SHARED = (TermName.MICROSCOPE, TermName.APPROACH, TermName.YAW)
-"""Terms whose coefficients all views share."""
-
-OF_LINES = (TermName.LINE_ECCENTRICITY, TermName.ROTATION)
-"""Terms that only readings of lines have, each view its own."""
-
-
 @dataclass(frozen=True)
 class ModelTerm:
     """A term estimated together with the map.
 
     Attributes
     ----------
-    name : TermName
-        Which.
+    name : str
+        Of its block (`selfcal_ros.blocks`).
     size : float
-        Standard deviation of its coefficients as known from elsewhere, in `UNITS`; infinite if
+        Standard deviation of its coefficients as known from elsewhere, SI unit; infinite if
         the readings alone determine them, 0 if they are known to be zero.
     parts : tuple of float
-        For a microscope: standard deviations of scale, turn and shear, if they differ;
-        `size` is then the largest.
+        Standard deviations of the parts of its block, if they differ; `size` is then the largest.
 
     Raises
     ------
@@ -92,18 +40,20 @@ class ModelTerm:
         For an unknown term.
     """
 
-    name: TermName
+    name: str
     size: float = math.inf
     parts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Accept a name as plain text, too."""
-        if self.name not in list(TermName):
-            raise InputError("ModelTerm", f"the term '{self.name}' is unknown",
-                             known_are(self.name, TermName))
-        object.__setattr__(self, "name", TermName(self.name))
+        """Refuse an unknown name; the size of several parts is the largest."""
+        _ = self.block
         if self.parts:
             object.__setattr__(self, "size", max(self.parts))
+
+    @property
+    def block(self) -> Block:
+        """What it is."""
+        return block_of(self.name)
 
     @property
     def free(self) -> bool:
@@ -111,10 +61,11 @@ class ModelTerm:
         return math.isinf(self.size)
 
     def size_of(self, component: str) -> float:
-        """Return the size of one coefficient; those of a microscope may differ."""
-        if not self.parts:
-            return self.size
-        return self.parts[{"scale": 0, "turn": 1}.get(component, 2)]
+        """Return the size of one coefficient; those of parts may differ."""
+        for size, (_, components) in zip(self.parts, self.block.parts, strict=False):
+            if component in components:
+                return size
+        return self.size
 
     def scaled(self, factor: float) -> "ModelTerm":
         """Return the term with all its sizes multiplied by `factor`."""
@@ -132,37 +83,37 @@ class ModelTerm:
         return ":".join([str(self.name), *(f"{size:g}" for size in sizes)])
 
 
-def microscope_term(scale_u: float = 0.01, rotation_u: float = 0.01,
-                    shear_u: float = 0.002) -> ModelTerm:
+def default_of(block: Block) -> ModelTerm:
+    """Return what is assumed of a block for every measurement unless it is declared."""
+    if block.parts:
+        return ModelTerm(block.name, parts=block.sizes)
+    return ModelTerm(block.name, max(block.sizes))
+
+
+@cache
+def default_terms() -> tuple[ModelTerm, ...]:
+    """Return the assumptions for every measurement unless declared (GUM type B)."""
+    return tuple(default_of(block) for block in blocks().values() if block.sizes)
+
+
+def microscope_term(*parts: float) -> ModelTerm:
     """Return the microscope's term from prior standard uncertainties.
 
     Parameters
     ----------
-    scale_u, rotation_u, shear_u : float
+    parts : float
         Standard uncertainty of its scale (m/m), of its rotation relative to the axes (rad), and of
-        half the difference of its scales and half its squareness error.
+        half the difference of its scales and half its squareness error; missing ones by default.
     """
-    return ModelTerm(TermName.MICROSCOPE, parts=(scale_u, rotation_u, shear_u))
-
-
-DEFAULT_TERMS = (
-    microscope_term(),
-    ModelTerm(TermName.PLATE_STRAIN, 7e-8),
-    ModelTerm(TermName.LINE_ECCENTRICITY, 2e-6),
-    ModelTerm(TermName.ROTATION, 1e-7),
-    ModelTerm(TermName.YAW, 1e-4))
-"""Assumptions for every measurement unless declared (GUM type B): the pixel size is known to 1 %
-and the rotation of the camera to 10 mrad; a plate of fused silica is strained by 5e-8 by clamping
-and by as much again by 0.1 K; the circle of lines is centred to 0.1 um at a radius of 50 mm, and
-moves by 5 nm there between the marks and the lines of a view; the stage turns by 0.1 mrad (20")
-from site to site, more than the yaw of almost any stage, so that images determine it."""
+    block = next(block for block in blocks().values() if block.of_offsets)
+    return ModelTerm(block.name, parts=(*parts, *block.sizes[len(parts):]))
 
 
 def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
-    """Return the terms written as ``TERM`` or ``TERM:SIZE``, in the order of `TermName`.
+    """Return the terms written as ``TERM`` or ``TERM:SIZE``, in the order of the blocks.
 
-    A microscope may have three sizes, ``microscope:SCALE:TURN:SHEAR``. A size of 0 means that the
-    term is known to be zero.
+    One with parts may have a size of each, ``microscope:SCALE:TURN:SHEAR``. A size of 0 means that
+    the term is known to be zero.
 
     Parameters
     ----------
@@ -176,31 +127,39 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
     InputError
         For an unknown or duplicate term, or an invalid size.
     """
-    found: dict[TermName, ModelTerm] = {}
+    found: dict[str, ModelTerm] = {}
     for text in (part.strip() for item in texts for part in item.split(",")):
         if not text:
             continue
         name, colon, size = text.partition(":")
-        if name not in list(TermName):
-            raise InputError(where, f"the term '{name}' is unknown", known_are(name, TermName))
-        term = _term(TermName(name), size.split(":") if colon else [], f"{where}: {name}")
+        if name not in blocks():
+            raise InputError(where, f"the term '{name}' is unknown", known_are(name, blocks()))
+        term = _term(name, size.split(":") if colon else [], f"{where}: {name}")
         if term.name in found:
             raise InputError(where, f"the term '{name}' is given twice", "remove one")
         found[term.name] = term
-    return tuple(found[name] for name in TermName if name in found)
+    return in_order(found.values())
 
 
-def _term(name: TermName, texts: list[str], where: str) -> ModelTerm:
-    sizes = [_size(text, where) for text in texts]
+def in_order(terms: Iterable[ModelTerm]) -> tuple[ModelTerm, ...]:
+    """Return terms in the order of the blocks."""
+    found = {term.name: term for term in terms}
+    return tuple(found[name] for name in blocks() if name in found)
+
+
+def _term(name: str, texts: list[str], where: str) -> ModelTerm:
+    sizes, parts = [parse_size(text, where) for text in texts], block_of(name).parts
     if len(sizes) < 2:
         return ModelTerm(name, sizes[0] if sizes else math.inf)
-    if name is not TermName.MICROSCOPE or len(sizes) != 3:
-        raise InputError(where, f"{len(sizes)} sizes are given",
-                         "give one, or those of microscope:SCALE:TURN:SHEAR")
-    return microscope_term(*sizes)
+    if len(sizes) != len(parts):
+        raise InputError(where, f"{len(sizes)} sizes are given", "give one" + (
+            f", or those of {':'.join([name, *(part.upper() for part, _ in parts)])}"
+            if parts else ""))
+    return ModelTerm(name, parts=tuple(sizes))
 
 
-def _size(text: str, where: str) -> float:
+def parse_size(text: str, where: str) -> float:
+    """Return a size written in SI units, or 0."""
     try:
         size = float(text)
     except ValueError:
@@ -221,10 +180,10 @@ def with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str,
         return terms
     fields = checked_fields(raw, where, {}, {
         "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
-    if any(term.startswith(TermName.MICROSCOPE) for term in terms):
+    microscope = microscope_term(*(parse_size(f"{size:g}", where) for size in fields.values()))
+    if any(term.partition(":")[0] == microscope.name for term in terms):
         raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
-    sizes = ":".join(f"{size:g}" for size in fields.values())
-    return tuple(map(str, parse_terms([*terms, f"{TermName.MICROSCOPE}:{sizes}"], where)))
+    return tuple(map(str, parse_terms([*terms, str(microscope)], where)))
 
 
 def terms_of(texts: list, where: str) -> tuple[str, ...]:

@@ -9,12 +9,12 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.apply import StageMap
+from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError, printable, visible
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import COMBINED, CalibrationResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.reporting.chapters import convention_section, said
 from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
@@ -209,7 +209,8 @@ def _model_texts(result: CalibrationResult) -> list[str]:
     texts = [f"{result.model.misalignment} misalignments of the plate in each view; method: "
              f"{result.method}, {result.sense.replace('_', ' ')}"]
     for term in result.model.terms:
-        if term.name == TermName.LINE_ECCENTRICITY and not result.plate.angular_count:
+        block = blocks().get(term.name)
+        if block is not None and block.of_lines and not result.plate.angular_count:
             continue
         size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
         texts.append(f"term {term.name}: {size}, {term.source}")

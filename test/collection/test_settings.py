@@ -22,7 +22,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import DEFAULT_TERMS
+from selfcal_ros.model.terms import default_terms
 
 EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
@@ -221,7 +221,7 @@ def model_of(planned=(), **given):
     return [str(term) for term in options.model_terms(visits=True)]
 
 
-ASSUMED = [str(term) for term in DEFAULT_TERMS]
+ASSUMED = [str(term) for term in default_terms()]
 
 
 def test_what_is_known_of_the_microscope_is_assumed_unless_somebody_says_otherwise():

@@ -21,7 +21,7 @@ from selfcal_ros.files import read_json
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import session_digest, view_digest
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.model.terms import DEFAULT_TERMS
+from selfcal_ros.model.terms import default_terms
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.sessions.clocks import Run, supersedes
@@ -34,7 +34,7 @@ from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
 OTHER_SIGN = (np.kron(np.ones((2, 2)), np.eye(2)) * 1e-8).ravel()  # offsets rise with x, y
-ASSUMED = [term.name for term in DEFAULT_TERMS if term.name != "yaw"]  # which images show
+ASSUMED = [term.name for term in default_terms() if term.name != "yaw"]  # which images show
 
 
 def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import eval_legendre
 
 from selfcal_ros.model.readings import Measurements, Sense
-from selfcal_ros.model.terms import OF_LINES, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 
 STEP = 1e-5
 """Of the differences, rad, m and m/m: what they leave out and what they round are then 1e-11."""
@@ -32,8 +32,8 @@ it; with them a microscope's turn and scale are those against the axes that it h
 NOTHING = 1e-8
 """Singular value of columns of unit length that is none."""
 
-MARKS = {TermName.PLATE_SCALE: ("scale",), TermName.PLATE_STRAIN: ("scale", "stretch", "shear"),
-         TermName.PLATE_SHAPE: tuple(f"{axis} {form}" for axis in "xy"
+MARKS = {"plate_scale": ("scale",), "plate_strain": ("scale", "stretch", "shear"),
+         "plate_shape": tuple(f"{axis} {form}" for axis in "xy"
                                      for form in ("xx", "xy", "yy"))}
 
 
@@ -63,7 +63,7 @@ class DenseFit:
         self.g, self.a, self.gt, self.at, self.pose, self.b = (
             slice(*pair) for pair in pairwise(ends))
         self.offset, self.p = self.seen, np.zeros(ends[-1])
-        magnified = any(term == TermName.MICROSCOPE for term, *_ in self.keys)
+        magnified = any(term == "microscope" for term, *_ in self.keys)
         self.places = places
         self.steps = PLACE_STEPS if places else STEPS if magnified or rigid else 1
         for _ in range(self.steps):
@@ -79,16 +79,16 @@ class DenseFit:
         lines = [v for v, view in enumerate(views) if len(view.k)]
         keys, size = [], []
         for term in terms:
-            if term.name is TermName.MICROSCOPE:
+            if term.name == "microscope":
                 mine = [(-1, part) for part in ("scale", "turn", "stretch", "shear")]
-            elif term.name is TermName.APPROACH:
+            elif term.name == "approach":
                 mine = [(-1, "x"), (-1, "y")]
-            elif term.name is TermName.DRIFT:
+            elif term.name == "drift":
                 mine = [(v, f"{axis} P{order}") for v in grid for order in range(1, degree + 1)
                         for axis in "xy"]
-            elif term.name is TermName.LINE_ECCENTRICITY:
+            elif term.name == "line_eccentricity":
                 mine = [(v, part) for v in lines[int(term.free):] for part in ("cos", "sin")]
-            elif term.name is TermName.ROTATION:
+            elif term.name == "rotation":
                 both = [v for v in lines if v in grid]
                 mine = [(v, "turn") for v in both[int(term.free):] if len(both) > 1]
             else:  # a yaw has columns with images only
@@ -177,7 +177,7 @@ class DenseFit:
         strained, added = np.zeros((2, len(self.keys), len(self.z)), dtype=complex)
         turned = np.zeros((len(self.keys), len(self.k)))
         for row, (term, v, part) in enumerate(self.keys):
-            if term in OF_LINES:
+            if term in ("line_eccentricity", "rotation"):
                 wave = {"cos": np.cos, "sin": np.sin, "turn": np.ones_like}[part]
                 turned[row] = wave(2 * np.pi * self.k / self.K) * (self.line_view == v)
             elif term in MARKS:
@@ -188,7 +188,7 @@ class DenseFit:
 
     def _of_plate(self, part, term):
         z, half = self.z, self.pitch * max(self.hx, self.hy)
-        if term == TermName.PLATE_SHAPE:
+        if term == "plate_shape":
             u, v = z.real / half, z.imag / half
             form = {"xx": u * u, "xy": 2 * u * v, "yy": v * v}[part[2:]]
             return form * (1 if part[0] == "x" else 1j)
@@ -196,9 +196,9 @@ class DenseFit:
         return {"scale": x + 1j * y, "stretch": x - 1j * y, "shear": y + 1j * x}[part]
 
     def _of_visit(self, term, part):
-        if term == TermName.DRIFT:
+        if term == "drift":
             return eval_legendre(int(part[3:]), self.tau) * (1 if part[0] == "x" else 1j)
-        if term == TermName.APPROACH:
+        if term == "approach":
             return self.sign * (self.sx if part == "x" else 1j * self.sy)
         x, y = self.offset.real, self.offset.imag
         return -{"scale": x + 1j * y, "turn": -y + 1j * x, "stretch": x - 1j * y,
@@ -262,7 +262,7 @@ class DenseFit:
         all others, are unknowns of the size 2 `shared` visits (method eq. 7.11).
         """
         feigned = [at for at, (term, _, part) in enumerate(self.keys, self.b.start)
-                   if term == TermName.MICROSCOPE and part in ("scale", "stretch")]
+                   if term == "microscope" and part in ("scale", "stretch")]
         changes = inverse_of(np.concatenate([self.design, held]))[feigned, :len(self.design)].T
         more = np.zeros((len(rows) + len(feigned), len(feigned)))
         more[:len(changes)] = changes

@@ -10,7 +10,7 @@ from scipy.stats import ncf
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.terms.planned import planned_ground
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 
 SIGMA = 20e-9
 TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
@@ -91,14 +91,14 @@ class Dense:
     def _columns(self, name, free):
         out = []
         views = range(len(self.visits))
-        if name is TermName.MICROSCOPE:
+        if name == "microscope":
             one = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]],
                             [[1, 0], [0, -1]], [[0, 1], [1, 0]]])
             out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
-        elif name is TermName.APPROACH:
+        elif name == "approach":
             out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
                    for h in ((1, 0), (0, 1))]
-        elif name is TermName.DRIFT:
+        elif name == "drift":
             of_view = np.array([about[0] for about in self.about])
             for v in views:
                 for degree in range(1, self.assumed.drift_degree + 1):
@@ -110,9 +110,9 @@ class Dense:
             turns = np.array([turn for _, _, turn, *_ in self.about])
             scale = np.stack([x, y]) * self.half
             shapes = {
-                TermName.PLATE_SCALE: [scale],
-                TermName.PLATE_STRAIN: [scale, scale * [[1], [-1]], scale[::-1]],
-                TermName.PLATE_SHAPE: [np.outer(d, q) for d in ((1, 0), (0, 1))
+                "plate_scale": [scale],
+                "plate_strain": [scale, scale * [[1], [-1]], scale[::-1]],
+                "plate_shape": [np.outer(d, q) for d in ((1, 0), (0, 1))
                                        for q in (x * x, 2 * x * y, y * y)]}[name]
             out = [np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
                    for v in views[int(free):] for shape in shapes]
@@ -173,7 +173,7 @@ class Dense:
         whole = self.design([ModelTerm(term.name) for term in terms])
         at, found = self.base.shape[1], []
         for term in terms:
-            if term.name is TermName.MICROSCOPE:
+            if term.name == "microscope":
                 found = [at, at + 2]
             at += self.columns(term.name, free=True).shape[1]
         return _inverse(whole)[found].T

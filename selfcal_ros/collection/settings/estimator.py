@@ -12,7 +12,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, microscope_term, parse_terms
+from selfcal_ros.model.terms import ModelTerm, default_terms, microscope_term, parse_terms
 from selfcal_ros.model.view import Plan
 from selfcal_ros.results import read_result
 
@@ -165,4 +165,4 @@ def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:
     if [word.strip() for word in settings.model_terms] == [NO_TERMS]:
         return ()
     microscope = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)
-    return tuple(microscope if term.name == microscope.name else term for term in DEFAULT_TERMS)
+    return tuple(microscope if term.name == microscope.name else term for term in default_terms())

@@ -8,6 +8,7 @@ the same classes, and the documentation is generated from them. An unknown name 
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_args
 
+from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.parameter import ManagedSettings, Parameter, Settings, declared
 from selfcal_ros.compensation.cells import Interpolation, Outside
@@ -15,7 +16,7 @@ from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE, TermName
+from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE
 
 NO_TERMS = "none"
 """The word for no terms, which overrides those of the plan."""
@@ -142,7 +143,7 @@ class SolverSettings(ManagedSettings):
         "", "temperatures for converting that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], "
         "e.g. 20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = measured where it is used")
     model_terms: list[str] = declared(
-        [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(TermName)}; the "
+        [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(BUILT_IN)}; the "
         f"size is a standard deviation, SI; 0 = exactly zero; empty = those of the plan; "
         f"{NO_TERMS} = none, not even those assumed by default")
     scale_u: float = declared(

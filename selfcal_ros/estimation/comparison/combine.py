@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.between import RUNS_LEVEL, Deviation, Mean, Run, mean_of
 from selfcal_ros.estimation.comparison.covariance import (
@@ -41,7 +42,6 @@ from selfcal_ros.model.result import (
     Noise,
     Observability,
 )
-from selfcal_ros.model.terms import SHARED
 from selfcal_ros.model.verdict import (
     BudgetLine,
     Enlargement,
@@ -197,7 +197,7 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
     Terms of the microscope that are known from elsewhere, and the reference length.
     """
     terms = {term.name: term for term in result.model.terms}
-    names = [name for name in map(str, SHARED)
+    names = [name for name, block in blocks().items() if block.shared
              if name in terms and remaining_part(terms[name]) >= TOLD]
     of_terms = result.extra[KEY]["terms"] if KEY in result.extra else []
     factors = factors_of(result)[np.isin(of_terms, names)][:, :, known]

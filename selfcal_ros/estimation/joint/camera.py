@@ -20,7 +20,6 @@ from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 
@@ -357,10 +356,11 @@ def yaw_of(model: ModelFit, sense: Sense) -> dict[str, Any] | None:
     images, nodes = model.problem.images, model.problem.ground.yaw
     if images is None or images.yaw is None or nodes is None or model.equations is None:
         return None
+    name = next(term.name for term in model.problem.terms if term.block.of_images)
     free = replace(model.equations,
-                   columns=model.equations.columns.scaled(TermName.YAW, math.inf))
-    rows = free.rows([TermName.YAW]) & (free.norm > free.norm.max() * UNREAD)
-    seen = rows[free.rows([TermName.YAW])]
+                   columns=model.equations.columns.scaled(name, math.inf))
+    rows = free.rows([name]) & (free.norm > free.norm.max() * UNREAD)
+    seen = rows[free.rows([name])]
     if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=UNREAD) > 1:
         return None
     noise, taken = model.found.xy, model.coefficients

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import TermEquations, next_coefficients, score
 from selfcal_ros.estimation.terms.sizes import SizeTest, size_tests
 from selfcal_ros.model.artifact import Interpolation
-from selfcal_ros.model.terms import SHARED, ModelTerm
+from selfcal_ros.model.terms import ModelTerm
 
 MAX_COEFFICIENTS = 31 * 31
 """Largest refined spline that is fitted: a few seconds of one processor."""
@@ -159,7 +159,7 @@ def fit_model(problem: Problem,
     if not any(test.contradicted for test in sizes):
         return replace(model, sizes=sizes)
     for term in problem.terms:
-        alone = _size_tests(model, [term] if term.name in SHARED else [])
+        alone = _size_tests(model, [term] if term.block.shared else [])
         if any(test.contradicted for test in alone):
             simpler = settled(_raised(problem, alone), check)
             rest = _size_tests(simpler, [other for other in problem.terms if other is not term])

@@ -9,11 +9,12 @@ solves the same factored equations (Gauss-Newton).
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.blocks import Block, block_of
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
@@ -34,20 +35,22 @@ from selfcal_ros.estimation.terms.projection import (
 )
 from selfcal_ros.estimation.terms.sizes import SizeTest
 from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
-from selfcal_ros.model.terms import OF_PLATE, TermName
 
 MAX_STEPS = 100
 
 RESOLUTION = 1e-12
 """Change of a reading, against the largest misalignment, at which rotations stand still."""
 
+ROUGH_RESOLUTION = 1e-11
+"""The same once steps no longer shrink."""
+
 OF_NOISE = 1e-3
 """Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
 no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
 
-OF_LARGEST = 1e-4
-"""Change, against the largest of all steps, from which one that grows again is rounding: while an
-iteration converges its steps shrink."""
+LATE, OF_NOISE_LATE = 20, 0.1
+"""Steps after which rounding is all that moves, and the change that is none from then on: plates
+laid millimetres beside their places make the offsets, and their rounding, as large."""
 
 LINEAR = 1e-3
 """Relative change of the misalignments' covariance, or of the weight of lines that have terms of
@@ -145,17 +148,15 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
-    before, most, peak = np.inf, 0.0, float(np.abs(problem.grid.y).max())
+    before, peak = np.inf, float(np.abs(problem.grid.y).max())
     for number in range(MAX_STEPS):
         change = state.step()
-        most = max(most, change)
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
         if change <= max(RESOLUTION * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
-        if stuck and state.within_noise(change):
-            return state.finished()
-        if change > before and change <= OF_LARGEST * most:
+        part = OF_NOISE if number < LATE else OF_NOISE_LATE
+        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
             return state.finished()
         if change > DIVERGES * peak:
             break
@@ -193,11 +194,11 @@ class _State:
         self.offset_steps = OFFSET_STEPS
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
-        self.microscope = next((term for term in problem.terms
-                                if term.name is TermName.MICROSCOPE), None)
+        self.of_offsets = next((term for term in problem.terms
+                                if block_of(term.name).of_offsets), None)
         if problem.terms:
             ground = without_noise(problem.ground, self.found.residuals)
-            columns = term_columns(ground, problem.terms, problem.drift_degree)
+            columns = term_columns(ground, problem.terms)
             self._linearise(columns, reduce_columns(problem.system.grid, columns.shapes))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
@@ -210,11 +211,11 @@ class _State:
     def _refresh(self, equations: TermEquations, reduced: ReducedColumns) -> None:
         """Set up what has changed of the equations: the offsets' columns, or weights."""
         columns = equations.columns
-        if 0 < self.steps <= self.offset_steps and (self.microscope or self.problem.moves):
+        if 0 < self.steps <= self.offset_steps and (self.of_offsets or self.problem.moves):
             columns = self._anew(columns)
-            if self.microscope is not None:
+            if self.of_offsets is not None:
                 reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
-                                      columns.rows([TermName.MICROSCOPE]))
+                                      columns.having(lambda block: block.of_offsets))
         elif not self._stale(equations):
             return
         self._linearise(columns, reduced)
@@ -223,10 +224,10 @@ class _State:
         """Return the columns for the present visits and noise-free offsets."""
         ground = without_noise(self.moving.ground(self.found), self.found.residuals,
                                before.at_visits(self.coefficients))
-        columns = made_anew(ground, self.microscope, before, moved=self.problem.moves)
-        if self.microscope is None:
+        columns = made_anew(ground, self.of_offsets, before, moved=self.problem.moves)
+        if self.of_offsets is None:
             return columns
-        rows = columns.rows([TermName.MICROSCOPE])
+        rows = columns.having(lambda block: block.of_offsets)
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
@@ -264,13 +265,13 @@ class _State:
         least = min(np.abs(self.found.parameters - parameters).max(), np.abs(self.y - y).max())
         return float(max(least, self.moving.change))
 
-    def within_noise(self, change: float) -> bool:
-        """Return whether a change of the misalignments is far below their uncertainty."""
+    def within_noise(self, change: float, part: float) -> bool:
+        """Return whether a change of the misalignments is below a part of their uncertainty."""
         spread = np.diag(self.found.inverse)
         spread = spread[spread > FIXED * spread.max(initial=0.0)]
         sigma = self.found.xy.sigma
         return bool(len(spread) and np.isfinite(sigma)
-                    and change <= OF_NOISE * sigma * np.sqrt(spread.min()))
+                    and change <= part * sigma * np.sqrt(spread.min()))
 
     def finished(self) -> ModelFit:
         equations, reduced = self.equations, self.reduced
@@ -297,19 +298,19 @@ class _State:
         lines = equations.columns.lines
         if len(lines.at):
             taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
-            own = equations.rows([TermName.LINE_ECCENTRICITY])
+            own = equations.columns.having(lambda block: block.of_lines and not block.between)
             within = equations.inverse(sigma)[np.ix_(own, own)]
             dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
             angular = replace(self.problem.angular, y=self.lines_read - taken)
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
             self.theta = angular_part(self.problem)
 
-    def _of_terms(self, names: Collection[str] | None = None) -> np.ndarray | float:
-        """Return the effect of all terms, or of `names`, on the readings, (views, nx, ny), m."""
+    def _of_terms(self, trait: Callable[[Block], bool] = lambda block: True) -> np.ndarray | float:
+        """Return the effect of the terms with a trait on the readings, (views, nx, ny), m."""
         if self.equations is None:
             return 0.0
-        rows = None if names is None else self.equations.rows(names)
-        return self.equations.columns.shapes.combined(self.coefficients, rows)
+        columns = self.equations.columns
+        return columns.shapes.combined(self.coefficients, columns.having(trait))
 
     def _excess(self) -> np.ndarray | float:
         """Return what finite rotations add to the linear model, in the frame of the plate, m.
@@ -324,8 +325,8 @@ class _State:
         turn = np.expm1(1j * phi)
         frame = np.expm1(-1j * self.problem.turn_rad)[:, None, None]
         return (turn - 1j * phi) * (grid.views.z * length) + turn * (
-            self.found.plate + self._of_terms(OF_PLATE)) + frame * (
-                grid.views.gather(self.found.field) + self._of_terms((TermName.APPROACH,)))
+            self.found.plate + self._of_terms(lambda block: block.of_plate)) + frame * (
+                grid.views.gather(self.found.field) + self._of_terms(lambda block: block.of_map))
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:

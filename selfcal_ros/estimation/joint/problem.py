@@ -18,7 +18,7 @@ from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, between_visits
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
+from selfcal_ros.model.terms import ModelTerm
 
 LEAST_DOF = 0.5
 """Degrees of freedom of residuals below which they are rounding: terms with sizes leave fractions
@@ -184,8 +184,6 @@ class Problem:
         Whether the plate turns by finite angles, or as in the papers' linear form.
     terms : tuple of ModelTerm
         Terms of the model beside stage, plate and misalignments.
-    drift_degree : int
-        Degree of a drift's polynomial.
     residuals_xy : tuple, optional
         (sigma, degrees of freedom) of the residuals where they are not those of the grid alone:
         after terms were taken off.
@@ -212,7 +210,6 @@ class Problem:
     reference: ReferenceLength | None = None
     rigid: bool = True
     terms: tuple[ModelTerm, ...] = ()
-    drift_degree: int = DRIFT_DEGREE
     residuals_xy: tuple[float, float] | None = None
     dof_lines: float = 0.0
     turn_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))

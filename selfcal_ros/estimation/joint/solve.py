@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import (
     NoDataError,
     NotIdentifiableError,
@@ -60,7 +61,6 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.terms import VISIT_TERMS, TermName
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan, cells_seen
 
@@ -94,7 +94,7 @@ def _fitted(measurements: Measurements,
     Where that does not converge with the places of the stage readings count for their sites, and
     then less is assumed.
     """
-    of_visits = tuple(term for term in options.assumed if term.name in VISIT_TERMS)
+    of_visits = tuple(term for term in options.assumed if term.block.needs_visits)
     failed: NotSettledError | None = None
     for assumed in dict.fromkeys((options.assumed, of_visits, ())):
         problem, seen = prepare(measurements, replace(options, assumed=assumed))
@@ -133,19 +133,20 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         raise NotIdentifiableError(refusal(seen), seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
-    ground, rigid = ground_of(measurements, grid, half_width_m), options.finite_rotations
+    ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
+    rigid = options.finite_rotations
     terms = tuple(
         term for term in options.model_terms(
             visits=all(v is not None for v in ground.visits), assumed=rigid)
         if ground.has(term.name))
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), half_width_m, conditions, ground,
-        options.reference, rigid, terms, options.drift_degree,
+        options.reference, rigid, terms,
         places=places_of(measurements, grid, ground, system.known_sites),
         at_places=options.at_places,
         images=image_noise(
             measurements.artifact, [v.view for v in measurements.views], system,
-            ground.yaw if TermName.YAW in [term.name for term in terms] else None,
+            ground.yaw if any(term.block.of_images for term in terms) else None,
         ) if measurements.has_images else None)
     return turned(problem) if problem.rigid else replace(
         problem, turn_rad=np.zeros(len(grid.index))), seen
@@ -330,7 +331,7 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
         if sense is Sense.PLATE_MOVES:
             lines[:, 0] = -lines[:, 0, -np.arange(lines.shape[2]) % lines.shape[2]]
     microscope = -length * np.array([[
-        column.term == TermName.MICROSCOPE and column.component == part
+        block_of(column.term).of_offsets and column.component == part
         for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)
     return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
                 len(plates), 2, *system.grid.views.plate_shape),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability.plan_check import (
@@ -24,7 +25,7 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction
 from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
-from selfcal_ros.model.terms import UNITS, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 
@@ -89,7 +90,7 @@ class PlanBudget:
 
 @one_thread()
 def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
-                alone: Prediction, *, asked: Iterable[TermName] = ()) -> PlanBudget:
+                alone: Prediction, *, asked: Iterable[str] = ()) -> PlanBudget:
     """Return the predicted budget of a plan that identifies the stage and its free terms.
 
     Parameters
@@ -102,7 +103,7 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
         Noise, offsets, visiting order.
     alone : Prediction
         Uncertainty without terms, from `predict_plan`.
-    asked : iterable of TermName
+    asked : iterable of str
         The terms that somebody declared; the others are defaults.
     """
     if plan.artifact.shape[0] * plan.artifact.shape[1] > MAX_SITES:
@@ -124,7 +125,7 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
             if effect.mean() > NEGLIGIBLE * noise.mean():
                 source = "declared" if term.name in declared else "default"
                 lines.append(_line(quantity, str(term.name), effect, u=term.size,
-                                   unit=UNITS[term.name], source=source))
+                                   unit=term.block.unit, source=source))
     budget = PlanBudget(tuple(lines), {})
     return replace(budget, removals=_removals(budget, plan, terms, assumed))
 
@@ -168,7 +169,7 @@ def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
     for line in budget.lines:
         if line.component == NOISE or not budget.share(line) > MATTERS:
             continue
-        kind, steps = _changes(plan, TermName(line.component))
+        kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)
         best = min(((effect(step, line), step) for step in steps), default=None,
                    key=lambda item: item[0])
@@ -178,10 +179,8 @@ def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
     return out
 
 
-def _changes(plan: Plan, name: TermName) -> tuple[str, list[Step]]:
+def _changes(plan: Plan, name: str) -> tuple[str, list[Step]]:
     """Return the kind of change that may determine a term, and the changes of that kind."""
-    if name is TermName.MICROSCOPE:
-        return "check_stops", check_stops(plan)
-    if name in (TermName.DRIFT, TermName.APPROACH):
-        return "order", other_orders(plan)
-    return "view", more_views(plan)
+    steps = {"check_stops": check_stops, "order": other_orders, "view": more_views}
+    change = block_of(name).change
+    return change, steps[change](plan)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtri
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import planned_system
@@ -34,7 +35,7 @@ from selfcal_ros.estimation.terms.planned import (
 from selfcal_ros.estimation.terms.sizes import require_terms_told
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import Plan
 
 DRAWS = 20_000
@@ -47,7 +48,7 @@ class TermCheck:
 
     Attributes
     ----------
-    name : TermName
+    name : str
         Which.
     model : str
         In the model as ``free`` or ``sized``; empty if not in the model.
@@ -62,7 +63,7 @@ class TermCheck:
         Probability that the test for causes then detects it, 0 to 1.
     """
 
-    name: TermName
+    name: str
     model: str
     unseen_modes: int
     size: float
@@ -78,7 +79,12 @@ class TermCheck:
     @property
     def unit(self) -> str:
         """SI unit of `size`."""
-        return UNITS[self.name]
+        return block_of(self.name).unit
+
+
+def nominal_sizes() -> dict[str, float]:
+    """Return the sizes for which the effects of terms on a plan are stated, by name."""
+    return {name: block.nominal for name, block in blocks().items() if block.nominal}
 
 
 class PlannedTerms:
@@ -105,7 +111,7 @@ class PlannedTerms:
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
         ground = planned_ground(plan.artifact, plan.views, system, assumed)
-        sized = [ModelTerm(name, size) for name, size in NOMINAL_SIZES.items()]
+        sized = [ModelTerm(name, size) for name, size in nominal_sizes().items()]
         self.every = planned_equations(system, ground, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
@@ -131,12 +137,12 @@ class PlannedTerms:
         return replace(seen, rank=seen.rank + free, unknowns=seen.unknowns + free)
 
     @one_thread()
-    def check(self, name: TermName, size: float, level: float) -> TermCheck:
+    def check(self, name: str, size: float, level: float) -> TermCheck:
         """Return the check of the plan against a term.
 
         Parameters
         ----------
-        name : TermName
+        name : str
             Which.
         size : float
             Standard deviation of its coefficients.
@@ -153,15 +159,15 @@ class PlannedTerms:
         """Return the prediction `alone` with the contribution of the model's terms added."""
         return with_part_of_terms(alone, self.of_model, self.repeats)
 
-    def _others(self, name: TermName) -> list[ModelTerm]:
+    def _others(self, name: str) -> list[ModelTerm]:
         return [term for term in self.model if term.name != name]
 
-    def _unseen_modes(self, name: TermName) -> int:
+    def _unseen_modes(self, name: str) -> int:
         others = [term for term in self._others(name) if term.free]
         return (_n_unseen(with_terms(self.every, [*others, ModelTerm(name)]))
                 - _n_unseen(with_terms(self.every, others)))
 
-    def _effect(self, name: TermName, size: float) -> tuple[float, float]:
+    def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
         every, others = self.every, self._others(name)
         term, model = every.rows([name]), rows_of(every.columns, others)
@@ -174,7 +180,7 @@ class PlannedTerms:
                                           (fields.imag**2).sum(axis=1)])[:, known])
         return rms(spread), float(spread.max())
 
-    def _power(self, name: TermName, size: float, level: float) -> float:
+    def _power(self, name: str, size: float, level: float) -> float:
         every, others = self.every, self._others(name)
         beside = with_terms(every, [ModelTerm(term.name) for term in others])
         values, rank = self._information(name, beside)
@@ -191,12 +197,12 @@ class PlannedTerms:
         noise = rng.chisquare(dof, DRAWS) / dof
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
-    def _information(self, name: TermName, beside: TermEquations) -> tuple[np.ndarray, int]:
+    def _information(self, name: str, beside: TermEquations) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
         every = self.every
         term = every.rows([name])
         others = rows_of(every.columns,
-                         [ModelTerm(TermName(n)) for n in {c.term for c in beside.columns.columns}])
+                         [ModelTerm(n) for n in {c.term for c in beside.columns.columns}])
         cross = every.information[np.ix_(others, term)]
         rest = every.information[np.ix_(term, term)] - cross.T @ beside.inverse(
             0.0) @ beside.unbiased_sums(cross)
@@ -234,12 +240,12 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
                    uy=np.sqrt(alone.uy**2 + y.reshape(shape)), u_theta=u_theta)
 
 
-def check_terms(planned: PlannedTerms, sizes: Mapping[TermName, float],
+def check_terms(planned: PlannedTerms, sizes: Mapping[str, float],
                 level: float) -> tuple[TermCheck, ...]:
-    """Return the checks against all terms; `sizes` override `NOMINAL_SIZES`."""
+    """Return the checks against all terms; `sizes` override the nominal ones."""
     own = {term.name: term.size for term in planned.model if not term.free}
-    wanted = NOMINAL_SIZES | own | dict(sizes)
-    return tuple(planned.check(name, wanted[name], level) for name in NOMINAL_SIZES)
+    wanted = nominal_sizes() | own | dict(sizes)
+    return tuple(planned.check(name, wanted[name], level) for name in nominal_sizes())
 
 
 def _n_unseen(equations: TermEquations) -> int:

@@ -36,7 +36,7 @@ from selfcal_ros.estimation.observability.unseen import equivalent_key
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.terms import VISIT_TERMS, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import Plan, View
 
 SEARCH_SIZE = 11
@@ -203,9 +203,9 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
         views += _anywhere(plan, views, lambda added: score(added).key(criterion))
     steps = [*views, *more_repeats(plan)]
     terms, every = (against.terms, against.every) if against else ((), ())
-    if any(term.name in (TermName.DRIFT, TermName.APPROACH) for term in terms):
+    if any(term.block.change == "order" for term in terms):
         steps += other_orders(plan)
-    if TermName.MICROSCOPE in [term.name for term in every]:
+    if any(term.block.change == "check_stops" for term in every):
         steps += check_stops(plan)
     out = []
     for number, step in enumerate(steps):
@@ -314,10 +314,10 @@ def _search(field: Plan, pool: list[View], free: int, *, criterion: str, against
     """
     pool = [replace(view, angular=False) for view in pool]
     known: dict[tuple, tuple[float, ...]] = {}
-    one_by_one = against is not None and any(term.name in VISIT_TERMS for term in against.terms)
+    one_by_one = against is not None and any(term.block.needs_visits for term in against.terms)
     if against is not None:  # no choice of views determines the default terms of the visits
         against = replace(against, by_default=tuple(
-            term for term in against.by_default if term.name not in VISIT_TERMS))
+            term for term in against.by_default if not term.block.needs_visits))
 
     def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
         views = (pool[0], *(pool[i] for i in chosen))

@@ -24,7 +24,7 @@ from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Key, Measurements, left_out, without
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Finding
 
 OUTLIER_LEVEL = 0.01
@@ -138,7 +138,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             "taken_for_slip", cause.size, cause.u, cause.unit, cause.p, cause.view, cause.axis,
             cause.mark, {**cause.details, "cause": cause.name, "told": cause.told,
                          "slip_in": slip.view})))
-        options = replace(options, terms=(*options.terms, ModelTerm(TermName(cause.name))))
+        options = replace(options, terms=(*options.terms, ModelTerm(cause.name)))
         try:
             flattened = _flattened(at.measurements, options)
         except (NotIdentifiableError, InputError):

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
@@ -27,7 +28,6 @@ from selfcal_ros.estimation.terms.shapes import shapes_in_full
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
 
 PREDICTION_LEVEL = 1e-3
 """Probability that the prediction error of good readings exceeds its limit."""
@@ -42,10 +42,6 @@ MIN_DRAWS = 16
 
 TOGETHER = 20_000
 """Number of readings computed at once: several draws of a small field, one of a large one."""
-
-
-OF_A_VIEW = (TermName.DRIFT, *OF_PLATE)
-"""Terms of marks with separate coefficients for each view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +86,10 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
     own = [out[:0]]
     if equations is not None:
         ground = _in_time_of(ground, grid, kept, held)
-        columns = term_columns(ground, problem.terms, problem.drift_degree)
+        columns = term_columns(ground, problem.terms)
         at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
         for column, block in zip(columns.columns, columns.grid, strict=True):
-            if column.term in OF_LINES:
+            if block_of(column.term).of_lines:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1
             row = -1 if shared else _fitted_row(problem.ground, ground, rows, column.view)

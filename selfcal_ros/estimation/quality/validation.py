@@ -31,7 +31,6 @@ from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.prediction import (
-    OF_A_VIEW,
     HeldReadings,
     fitted_misalignment,
     held_readings,
@@ -197,7 +196,7 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
     square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
     own = [str(term.name) for term in model.problem.terms
-           if term.free and term.name in OF_A_VIEW]
+           if term.free and term.block.by_placing]
     if own and -1 in held.rows:
         return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
     if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtr
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
@@ -30,7 +31,6 @@ from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.units import MM_PER_M
 
 
@@ -62,7 +62,7 @@ class KnownPlate:
     def microscope(self) -> np.ndarray | None:
         """Coefficients of the microscope that it found, (4,); None if it did not estimate them."""
         term = next((term for term in self.result.model.terms
-                     if term.name == TermName.MICROSCOPE), None)
+                     if block_of(term.name).of_offsets), None)
         if term is None:
             return None
         found = {each.component: each.value for each in term.estimates}

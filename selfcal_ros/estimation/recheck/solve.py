@@ -58,7 +58,7 @@ from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lin
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import cells_seen
 
@@ -199,7 +199,7 @@ def plate_readings(measurements: Measurements, options: Options,
                           "record detections of the marks of the plate")
     artifact, system = measurements.artifact, system_for(grid, angular)
     views, length = system.grid.views, artifact.grid_pitch_m * max(artifact.reach)
-    ground = ground_of(measurements, grid, length)
+    ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
     lines, shape = artifact.angular_count, views.z_sites.shape
     nothing = Conditions(ThetaDatum.ZERO_MEAN, np.zeros((0, lines)), np.zeros((0, *shape)),
@@ -208,7 +208,7 @@ def plate_readings(measurements: Measurements, options: Options,
     read[views.site_index[grid.weight > 0]] = True
     problem = Problem(
         system, grid, angular, *repeats_of(measurements), length, nothing, ground,
-        rigid=options.finite_rotations, terms=terms, drift_degree=options.drift_degree,
+        rigid=options.finite_rotations, terms=terms,
         places=places_of(measurements, grid, ground, read.reshape(shape) if isinstance(
             views, LatticeViews) else np.ones(shape, dtype=bool)),
         at_places=options.at_places, turn_rad=np.zeros(len(grid.index)))
@@ -219,7 +219,7 @@ def plate_readings(measurements: Measurements, options: Options,
         raise InputError(f"plan '{measurements.plan_id}'", f"{count} readings of marks in images "
                          f"are beyond the limit of {MOST_OF_IMAGES} of a recheck",
                          "state fewer marks in an image (image in PLAN.yaml)")
-    return PlateReadings(measurements, problem, term_columns(quiet, terms, options.drift_degree),
+    return PlateReadings(measurements, problem, term_columns(quiet, terms),
                          np.nonzero(grid.weight), np.zeros(0, dtype=int) if cells is None
                          else stops_of(cells, grid.weight > 0))
 
@@ -227,7 +227,7 @@ def plate_readings(measurements: Measurements, options: Options,
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     """Return the terms; views of a known plate do not determine those without a size."""
     terms = tuple(term for term in options.model_terms(
-        visits=visits, assumed=options.finite_rotations) if term.name is not TermName.ROTATION)
+        visits=visits, assumed=options.finite_rotations) if not term.block.between)
     for term in terms:
         if term.free:
             raise InputError("model_terms", f"views of a known plate cannot determine the term "
@@ -265,7 +265,7 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
     noise = np.diag(white) + images @ images.T + terms @ terms.T
     microscope, size = readings.of_microscope()
     found = plate.microscope
-    if found is None or any(term.name is TermName.MICROSCOPE for term in options.terms):
+    if found is None or any(term.block.of_offsets for term in options.terms):
         own, found = stacked(microscope) * size, np.zeros(4)
         noise, microscope = noise + own @ own.T, 0 * microscope
     marks, of_marks = readings.of_marks()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
@@ -23,7 +24,6 @@ from selfcal_ros.estimation.normal.systems import Marks, lines_of
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import OF_LINES, TermName
 
 MOST_STEPS = 50
 """Most steps to the places of the stage and the rotations of the plate."""
@@ -154,7 +154,7 @@ class PlateReadings:
         But for the microscope's.
         """
         mine = [i for i, column in enumerate(self.columns.columns)
-                if column.term not in (TermName.MICROSCOPE, *OF_LINES)]
+                if not (block_of(column.term).of_offsets or block_of(column.term).of_lines)]
         view, row, column = self.at
         return self.columns.grid[mine][:, view, row, column].T, self.columns.size[mine]
 
@@ -162,7 +162,7 @@ class PlateReadings:
         """Return the readings for a unit of each of its coefficients, (r, 4), and their sizes."""
         out, size = np.zeros((len(self.at[0]), 4), dtype=complex), np.zeros(4)
         for i, column in enumerate(self.columns.columns):
-            if column.term == TermName.MICROSCOPE:
+            if block_of(column.term).of_offsets:
                 part = MICROSCOPE_PARTS.index(column.component)
                 out[:, part], size[part] = self.columns.grid[(i, *self.at)], column.size
         return out, size

@@ -10,7 +10,6 @@ import numpy as np
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.projection import ProjectedColumns
-from selfcal_ros.model.terms import TermName
 
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is zero."""
@@ -86,15 +85,16 @@ class TermEquations:
         """Coefficients to be determined by the readings alone, bool (p,)."""
         return np.isinf(self.columns.size)
 
-    def untold(self, rows: np.ndarray) -> np.ndarray:
+    def untold(self, rows: np.ndarray, limit: float | None = None) -> np.ndarray:
         """Return undetermined combinations of the coefficients `rows`, (p, k).
 
-        Orthonormal in scaled coefficients (times `norm`); others are taken as known.
+        Orthonormal in scaled coefficients (times `norm`); others are taken as known. Eigenvalues
+        up to `limit`, by default that of `rows`, count as zero.
         """
         scale = self.norm[rows]
         scaled = self.information[np.ix_(rows, rows)] / np.outer(scale, scale)
         values, vectors = np.linalg.eigh(scaled)
-        hidden = values <= self.limit(rows)
+        hidden = values <= (self.limit(rows) if limit is None else limit)
         out = np.zeros((len(rows), int(hidden.sum())))
         out[rows] = vectors[:, hidden]
         return out
@@ -109,7 +109,7 @@ class TermEquations:
     @cached_property
     def _norm_of_microscope(self) -> np.ndarray:
         """The norm of the microscope's columns, infinite for others, (p,)."""
-        return np.where(self.rows([TermName.MICROSCOPE]), self.norm, np.inf)
+        return np.where(self.columns.having(lambda block: block.of_offsets), self.norm, np.inf)
 
     @cached_property
     def _power(self) -> float:
@@ -157,9 +157,10 @@ class TermEquations:
         variance to the right-hand sides of scale and stretch (method eq. 7.11).
         """
         count = 2 * self.system.grid.n_readings + self.columns.within.dof
-        feigned = [column.term == TermName.MICROSCOPE and column.component in ("scale", "stretch")
-                   for column in self.columns.columns]
-        return (self.noise_m * count) ** 2 * np.array(feigned, dtype=float)
+        # those that multiply an offset along its own axis: 1, not i, in the direction of the noise
+        feigned = self.columns.having(lambda block: block.of_offsets) & (
+            self.columns.shapes.unit == 1)
+        return (self.noise_m * count) ** 2 * feigned
 
     @cached_property
     def _mixed(self) -> np.ndarray:
@@ -335,7 +336,8 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
         Noise of one grid reading, m.
     """
     right = equations.unbiased_sums(found.total)
-    hidden = equations.untold(np.ones(equations.n, dtype=bool)) / equations.norm[:, None]
+    everything = np.ones(equations.n, dtype=bool)
+    hidden = equations.untold(everything, UNTOLD) / equations.norm[:, None]
     if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
         right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
     prior = equations.prior(sigma_m)

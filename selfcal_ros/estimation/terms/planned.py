@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, term_columns
@@ -25,7 +26,7 @@ from selfcal_ros.estimation.terms.shapes import WithinMarks
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.terms import DRIFT_DEGREE, OF_PLATE, ModelTerm
+from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 from selfcal_ros.model.view import View, placings_of, with_sub_views
 from selfcal_ros.model.visit_order import approach_signs, visit_sequence
 
@@ -105,7 +106,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
                   placing_names=tuple(view.plan_view for view in grid_views),
-                  yaw=stage_yaw(artifact, grid_views))
+                  yaw=stage_yaw(artifact, grid_views),
+                  drift_degree=assumed.drift_degree)
 
 
 def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,
@@ -147,7 +149,7 @@ def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterab
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
     to them.
     """
-    columns = term_columns(ground, terms, assumed.drift_degree)
+    columns = term_columns(ground, terms)
     reduced = reduce_columns(system.grid, columns.shapes)
     n, length = 3 * system.grid.n_views, ground.half_width_m
     inverse, ratio = np.zeros((system.size, system.size)), 0.0
@@ -191,4 +193,4 @@ def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
 
 
 def _first(column: Column) -> bool:
-    return column.view == 0 and column.term in OF_PLATE
+    return column.view == 0 and block_of(column.term).of_plate

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 
 SIZE_LEVEL = 5e-4
 """Level of the test of each size."""
@@ -35,7 +36,7 @@ class SizeTest:
 
     Attributes
     ----------
-    name : TermName
+    name : str
         The term.
     given : float
         Its size, SI unit of the term; the largest one of a microscope.
@@ -53,7 +54,7 @@ class SizeTest:
         marginal likelihoods); 0 if they do not contradict the given one.
     """
 
-    name: TermName
+    name: str
     given: float
     shown: float
     allowed: float
@@ -172,36 +173,21 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
     return tuple(found)
 
 
-CURES = {
-    TermName.MICROSCOPE: "ask for check_stops in the plan, or align the microscope and leave "
-                         "the term out",
-    TermName.DRIFT: "visit the marks in more than one order, e.g. visit_order: x_back_y_back",
-    TermName.PLATE_SCALE: "add views that are turned and shifted",
-    TermName.PLATE_SHAPE: "add views shifted both ways along both axes, and one along a diagonal",
-    TermName.PLATE_STRAIN: "add views shifted both ways along both axes",
-    TermName.LINE_ECCENTRICITY: "centre the circle of lines better",
-    TermName.ROTATION: "read lines in more views with marks",
-    TermName.YAW: "let images show more marks, along x and along y",
-    TermName.APPROACH: "visit the marks from both sides, e.g. visit_order: x_back_y_back",
-}
-"""Remedies that make a term separable, in words."""
-
-
-def unseen_by_term(equations: TermEquations) -> dict[TermName, int]:
+def unseen_by_term(equations: TermEquations) -> dict[str, int]:
     """Return, for each free term that is not separable from the stage, the modes that it hides.
 
     Terms that are not separable only in combination are all named, with the modes hidden together.
     """
     free = {column.term for column in equations.columns.columns if column.size == float("inf")}
     out = {}
-    for name in TermName:
+    for name in blocks():
         if name in free:
             modes = equations.unseen(equations.rows([name])).shape[1]
             if modes:
                 out[name] = modes
     together = equations.unseen(equations.free).shape[1]
     if together and not out:
-        out = {name: together for name in TermName if name in free}
+        out = {name: together for name in blocks() if name in free}
     return out
 
 
@@ -221,7 +207,7 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     by_term = unseen_by_term(equations)
     texts = tuple(f"{name}: {count} mode{'s' * (count != 1)} of the stage look like it"
                   for name, count in by_term.items())
-    advice = tuple(f"{name}: {CURES[name]}, or give it a size, as in {name}:SIZE"
+    advice = tuple(f"{name}: {block_of(name).cure}, or give it a size, as in {name}:SIZE"
                    for name in by_term)
     free = int(equations.free.sum())
     found = replace(seen, unknowns=seen.unknowns + free, rank=seen.rank + free - modes,

@@ -8,18 +8,19 @@ The yaw of the stage has a coefficient at each node of a grid over the field, wi
 interpolation between them: a mark at d from the optical axis is read at d - i yaw d (eq. 4.17).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
-from selfcal_ros.model.terms import OF_LINES, OF_PLATE, TermName
+from selfcal_ros.model.terms import DRIFT_DEGREE
 from selfcal_ros.model.view import View, placings_of
 
 FARTHEST_M = 1e6
@@ -304,6 +305,8 @@ class TermInputs:
         Names of the placings of the views.
     yaw : StageYaw, optional
         How images depend on the yaw of the stage; None without images.
+    drift_degree : int
+        Degree of the polynomial of a view's time that a block may have.
     """
 
     z: np.ndarray
@@ -318,6 +321,36 @@ class TermInputs:
     placings: tuple[int, ...] = ()
     placing_names: tuple[str, ...] = ()
     yaw: StageYaw | None = None
+    drift_degree: int = DRIFT_DEGREE
+
+    def at_visits(self, values_of: Callable[[ViewVisits], np.ndarray],
+                  views: Iterable[int] | None = None, *, nominal: bool = False
+                  ) -> list[tuple[dict[int, np.ndarray], dict[int, np.ndarray]]]:
+        """Return patterns that differ between the visits of a mark.
+
+        Parameters
+        ----------
+        values_of : callable
+            Visits of a view -> complex (k, V), stage frame.
+        views : iterable of int, optional
+            Which views; otherwise all.
+        nominal : bool
+            Whether the means are those in the nominal frame, as the map is.
+
+        Returns
+        -------
+        list of (dict, dict)
+            Of each of the k: means of the marks, and values at the visits, by view, plate frame.
+        """
+        at, means = {}, {}
+        for view in range(len(self.visits)) if views is None else views:
+            if (visits := self.visits[view]) is not None:
+                at[view] = values_of(visits) * visits.phase
+                frame = visits.frame if nominal else 1.0
+                means[view] = visits.means(at[view] / frame, self.z.size)
+        number = len(next(iter(at.values()), ()))
+        return [({view: mean[row] for view, mean in means.items()},
+                 {view: value[row] for view, value in at.items()}) for row in range(number)]
 
     @property
     def members(self) -> dict[int, list[int]]:
@@ -329,24 +362,25 @@ class TermInputs:
 
     def names_of(self, term: str) -> tuple[str, ...]:
         """Return the names of the views of the columns of a term."""
-        if term in OF_LINES:
-            return self.line_names
-        of_placing = term in OF_PLATE or term == TermName.DRIFT
-        return self.placing_names if of_placing and self.placing_names else self.names
+        block = blocks().get(term)
+        if block is None or block.shared:
+            return self.names
+        return self.line_names if block.of_lines else self.placing_names or self.names
 
-    def has(self, term: TermName) -> bool:
+    def has(self, term: str) -> bool:
         """Return whether any reading can depend on a term."""
-        if term is TermName.YAW:
+        block = block_of(term)
+        if block.of_images:
             return self.yaw is not None
-        return term not in OF_LINES or bool(
-            self.with_lines if term is TermName.ROTATION else self.line_names)
+        return not block.of_lines or bool(self.with_lines if block.between else self.line_names)
 
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
         return (*self.names_of(term), "")[view]
 
 
-def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -> TermInputs:
+def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *,
+              drift_degree: int = DRIFT_DEGREE) -> TermInputs:
     """Return the ground of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
@@ -363,7 +397,8 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float) -
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
-                      stage_yaw(measurements.artifact, views) if measurements.has_images else None)
+                      stage_yaw(measurements.artifact, views) if measurements.has_images else None,
+                      drift_degree)
 
 
 def without_noise(ground: TermInputs, residuals: np.ndarray,

@@ -2,28 +2,23 @@
 """Causes: explanations with their largest component and its place; faults of angular lines."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import Any
 
 import numpy as np
-from scipy.special import eval_legendre, fdtrc
+from scipy.special import fdtrc
 
+from selfcal_ros.blocks import Located, block_of, blocks
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
-from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, FLOOR_M, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import UNITS, TermName
 from selfcal_ros.model.verdict import Cause
-
-TIMES = np.linspace(-1, 1, 101)
-"""Instants of a view at which the range of a drift is evaluated."""
 
 NOISY = 1.5
 """Ratio of a view's noise to that of the others above which it is a cause."""
@@ -33,10 +28,6 @@ SURE = 3.0
 
 CHECKED = 1e-6
 """Smallest share of a reading's error in its own residual: the part that other readings check."""
-
-Options = Iterable[tuple[dict[str, Any], np.ndarray]]
-"""Combinations of the coefficients, the most significant of which sizes a cause: the further fields
-of that cause, and the weights of the coefficients."""
 
 
 def cause_of(found: Explanation, ground: TermInputs) -> Cause:
@@ -50,10 +41,11 @@ def cause_of(found: Explanation, ground: TermInputs) -> Cause:
         Of the fit: names of the views, unit of a slip's rotation.
     """
     names = ground.names_of(found.name)
-    options = list(_OPTIONS[found.name](found, names, ground.half_width_m))
+    options = list(_OTHERS[found.name](found, names, ground.half_width_m)
+                   if found.name in _OTHERS else block_of(found.name).located(found, names))
     fields, value, u = max(((fields, *_linear(found, weights)) for fields, weights in options),
                            key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300))
-    unit = UNITS.get(found.name, "m")
+    unit = blocks()[found.name].unit if found.name in blocks() else "m"
     largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
     return Cause(**{"name": found.name, "size": value, "u": u, "unit": unit, "p": found.p,
                     "effect_rms": found.effect_m, "effect_max": largest, "told": found.whole,
@@ -119,80 +111,14 @@ def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
     return float(weights @ found.values), math.sqrt(max(variance, 0.0))
 
 
-def _each(found: Explanation, fields: Callable[[Column], dict[str, Any]]) -> Options:
-    """Yield every coefficient."""
-    for column, row in zip(found.columns, np.eye(len(found.columns)), strict=True):
-        yield fields(column), row
-
-
-def _microscope(found: Explanation, *_: object) -> Options:
-    return _each(found, lambda column: {
-        "unit": "rad" if column.component in ("turn", "shear") else "m/m",
-        "details": {"part": column.component}})
-
-
-def _approach(found: Explanation, *_: object) -> Options:
-    return _each(found, lambda column: {"axis": column.component})
-
-
-def _yaw(found: Explanation, *_: object) -> Options:
-    return (({}, row * np.sign(found.values)) for _, row in _each(found, lambda column: {}))
-
-
-def _drift(found: Explanation, names: tuple[str, ...], _: float) -> Options:
-    for view in sorted({column.view for column in found.columns}):
-        for axis in "xy":
-            shape = np.array([
-                eval_legendre(int(c.component[3:]), TIMES)
-                if c.view == view and c.component[0] == axis else 0 * TIMES
-                for c in found.columns])
-            path = found.values @ shape
-            yield {"view": names[view], "axis": axis}, (
-                shape[:, int(path.argmax())] - shape[:, int(path.argmin())])
-
-
-def _of_plate(found: Explanation, names: tuple[str, ...], _: float) -> Options:
-    """Yield the differences of the coefficients from those of the first view.
-
-    If the term is free, the first view has no coefficients of its own: they are 0.
-    """
-    for column, row in zip(found.columns, np.eye(len(found.columns)), strict=True):
-        row -= [c.view == 0 and c.component == column.component for c in found.columns]
-        if row.any():
-            yield {"view": names[column.view],
-                   "details": {"against": names[0], "part": column.component}}, row
-
-
-def _line_eccentricity(found: Explanation, names: tuple[str, ...], _: float) -> Options:
-    for view in sorted({column.view for column in found.columns}):
-        mine = np.array([column.view == view for column in found.columns])
-        size = float(np.hypot.reduce(found.values[mine]))
-        yield {"view": names[view]}, np.where(mine, found.values, 0.0) / (size or 1.0)
-
-
-def _rotation(found: Explanation, names: tuple[str, ...], _: float) -> Options:
-    """Yield the view that differs most from all others: a common rotation belongs to the datum."""
-    n, unit = len(found.values), np.eye(len(found.values))
-    apart = []
-    for at in range(n):
-        pairs = [_linear(found, unit[at] - unit[other]) for other in range(n) if other != at]
-        apart.append(min((abs(value) / max(u, 1e-300) for value, u in pairs), default=0.0))
-    at = int(np.argmax(apart))
-    weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
-    value, u = _linear(found, weights)
-    # u is that of the difference from the nearest
-    yield {"view": names[found.columns[at].view],
-           "u": max(u, abs(value) / max(apart[at], 1e-300))}, weights
-
-
-def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Options:
+def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Located:
     if found.mark is None:
         raise ValueError("a reading without its mark")
     yield {"view": names[found.columns[0].view], "mark": found.mark}, (
         found.values / np.hypot(*found.values))
 
 
-def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Options:
+def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Located:
     order = {column.component: i for i, column in enumerate(found.columns)}
     x, y, phi = (float(found.values[order[part]]) for part in ("x", "y", "phi"))
     size = math.hypot(x, y)
@@ -202,12 +128,8 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Op
            "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m}}, toward
 
 
-_OPTIONS: dict[str, Callable[..., Options]] = {
-    TermName.MICROSCOPE: _microscope, TermName.DRIFT: _drift, TermName.PLATE_SCALE: _of_plate,
-    TermName.PLATE_SHAPE: _of_plate, TermName.APPROACH: _approach, SLIP: _slip,
-    READING: _reading, TermName.PLATE_STRAIN: _of_plate,
-    TermName.LINE_ECCENTRICITY: _line_eccentricity, TermName.ROTATION: _rotation,
-    TermName.YAW: _yaw}
+_OTHERS: dict[str, Callable[..., Located]] = {SLIP: _slip, READING: _reading}
+"""What is no term: see `selfcal_ros.blocks.Block.located`."""
 
 
 def turned_too_far(model: ModelFit, result: CalibrationResult,
@@ -217,9 +139,11 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     A plate that moved does not explain that: the offsets of lines have the wrong sign, or those of
     marks the wrong unit. None otherwise, or if the model has no such rotation.
     """
-    if TermName.ROTATION not in [term.name for term in model.problem.terms]:
+    between = next((term.name for term in model.problem.terms
+                    if block_of(term.name).between), None)
+    if between is None:
         return None
-    held = fitted_term(model, TermName.ROTATION)
+    held = fitted_term(model, between)
     first = len(model.problem.ground.with_lines) - len(held.values)  # fewer if the term is free
     values, covariance = np.pad(held.values, (first, 0)), np.pad(held.covariance, (first, 0))
     apart, variance = abs(values[:, None] - values), np.diag(covariance)

@@ -17,6 +17,7 @@ from itertools import compress
 import numpy as np
 from scipy.special import fdtrc
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import noise_excess
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
@@ -30,7 +31,7 @@ from selfcal_ros.estimation.verdict.off_sites import (
     reading_columns,
     slip_columns,
 )
-from selfcal_ros.model.terms import SHARED, VISIT_TERMS, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,10 +269,10 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     ground = without_noise(problem.ground, model.found.residuals, known)
     own = [term.name for term in problem.terms]
     told = all(visits is not None for visits in ground.visits)
-    more = [ModelTerm(name) for name in TermName
-            if name not in own and (told or name not in VISIT_TERMS)]
+    more = [ModelTerm(block.name) for block in blocks().values()
+            if block.name not in own and (told or not block.needs_visits)]
     made, views = ColumnBuilder(ground), problem.system.grid.views
-    made.add_terms((*problem.terms, *more), problem.drift_degree)
+    made.add_terms((*problem.terms, *more))
     groups = list(_groups(made.columns, [term.name for term in more]))
     phases, every = views.phases.conj(), int(np.count_nonzero(ground.weight))
     if slips:
@@ -294,7 +295,7 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     right = score(equations, model.found.both_residuals, squares(problem, model.found),
                   coefficients=taken)
     # images determine the yaw: no other cause may gain from a size that is too small for it
-    sized = columns.rows([name for name in own if name is not TermName.YAW])
+    sized = columns.rows([name for name in own if not block_of(name).of_images])
     prior = np.where(sized, equations.prior(model.found.xy.sigma), 0.0)
     excess = noise_excess(problem, model.found.residuals)
     common = excess * model.found.xy.residuals**2 if problem.images else 0.0
@@ -302,21 +303,22 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
                                columns.rows(own))
 
 
-def _groups(columns: Sequence[Column], names: Iterable[TermName]) -> Iterator[Group]:
-    """Yield the columns of each term, those of each of its views, and those of a linear drift.
+def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
+    """Yield the columns of each term, those of each of its views, and those tested alone.
 
     By their indices.
     """
     of_view = np.array([c.view for c in columns], dtype=int)
-    steady = np.array([c.component.endswith("P1") for c in columns], dtype=bool)
+    alone = np.array([c.term in blocks() and blocks()[c.term].alone(c.component)
+                      for c in columns], dtype=bool)
     for name in names:
         whole = np.array([c.term == name for c in columns], dtype=bool)
         parts = [whole]
         for view in sorted(set(of_view[whole].tolist()) - {-1}):
             here = whole & (of_view == view)
             parts.append(here)
-            if name is TermName.DRIFT:
-                parts.append(here & steady)
+            if (here & alone).any():
+                parts.append(here & alone)
         yield from (Group(str(name), np.flatnonzero(rows), places=len(parts))
                     for rows in parts if rows.any())
 
@@ -339,7 +341,7 @@ def select_explanations(pool: Candidates, groups: list[Group],
         as_good = [(test, group) for test, group in good
                    if group is best or _replaces(pool, taken, group, best)]
         # the best part of each term; what all views share is simpler than what each view has
-        as_good.sort(key=lambda item: (item[1].name not in SHARED, -item[0][1]))
+        as_good.sort(key=lambda item: (not _is_shared(item[1].name), -item[0][1]))
         names: list[str] = []
         for (p, _), group in as_good:
             if group.name not in names:
@@ -353,9 +355,13 @@ def select_explanations(pool: Candidates, groups: list[Group],
     return found
 
 
+def _is_shared(name: str) -> bool:
+    return name in blocks() and blocks()[name].shared
+
+
 def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether `best` explains nothing beyond what `group` explains."""
-    if {SLIP, READING, TermName.ROTATION} & {group.name, best.name}:
+    if any(name not in blocks() or blocks()[name].between for name in (group.name, best.name)):
         return False
     before, after = pool.explain_each([taken | group.rows, taken | group.rows | best.rows])
     more = _test(pool, before, after, best)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
+from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
@@ -43,7 +44,7 @@ from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import NOMINAL_SIZES, UNITS, VISIT_TERMS, ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
@@ -174,7 +175,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     or the microscope was declared.
     """
     declared = not options.assumed or any(
-        term.name is TermName.MICROSCOPE and not term.free for term in options.terms)
+        term.block.of_offsets and not term.free for term in options.terms)
     seen = all(view.visits is not None for view in measurements.views if len(view.m))
     if declared or not seen or sign_is_shown(measurements):  # without offsets nothing can show it
         return []
@@ -182,7 +183,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     if model is None or model.equations is None:
         return []
     equations = model.equations
-    rows = equations.rows([TermName.MICROSCOPE])
+    rows = equations.columns.having(lambda block: block.of_offsets)
     scale = [at for at in np.flatnonzero(rows)
              if equations.columns.columns[at].component == "scale"]
     if not scale or not np.isfinite(model.found.xy.sigma):
@@ -200,12 +201,13 @@ def _scale_findings(solved: Solved, measurements: Measurements, options: Options
     reduces the scale and that of detections increases it: they give limits.
     """
     term = next((term for term in options.model_terms(visits=True)
-                 if term.name is TermName.MICROSCOPE), None)
+                 if term.block.of_offsets), None)
     u = 0.0 if term is None else term.size_of("scale")
     fitted = [estimate for each in solved.result.model.terms
-              if each.name == TermName.MICROSCOPE for estimate in each.estimates
+              if term is not None and each.name == term.name for estimate in each.estimates
               if estimate.component == "scale" and estimate.u < FITTED * u]
-    if np.isinf(u) or fitted or any(cause.name == TermName.MICROSCOPE for cause in causes):
+    if np.isinf(u) or fitted or any(
+            cause.name in blocks() and blocks()[cause.name].of_offsets for cause in causes):
         return []
     found = contradicted_scale(measurements, u)
     return [] if found is None else [Finding(
@@ -234,7 +236,7 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     if solved.model is None:
         return []
     problem = solved.model.problem
-    held = any(term.name is TermName.DRIFT for term in problem.terms)
+    held = any(term.block.of_time for term in problem.terms)
     visits = [view for view in problem.ground.visits if view is not None]
     once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
     return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
@@ -286,10 +288,6 @@ def _iso(stamp_ns: int) -> str:
         return f"{stamp_ns} ns"
 
 
-EXCLUDED = tuple(ModelTerm(name, NOMINAL_SIZES[name]) for name in (
-    TermName.DRIFT, TermName.PLATE_SHAPE, TermName.APPROACH))
-"""Terms that are not assumed by default; a change of scale is a strain, which is."""
-
 MATTERS = 0.3
 """Effect in standard uncertainties of the map, rms, below which it is not stated."""
 
@@ -312,15 +310,16 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
     problem = model.problem
     known = {term.name for term in (*options.terms, *problem.terms)}
     visited = all(visits is not None for visits in problem.ground.visits)
-    more = [term for term in EXCLUDED if term.name not in known
-            and (visited or term.name not in VISIT_TERMS)]
-    columns = term_columns(problem.ground, (*problem.terms, *more), problem.drift_degree)
+    more = [ModelTerm(block.name, block.nominal) for block in blocks().values()
+            if block.nominal and not {block.name, block.part_of} & known
+            and (visited or not block.needs_visits)]
+    columns = term_columns(problem.ground, (*problem.terms, *more))
     equations = equations_of(problem, model.found, columns)
     held, lines = model.covariance, []
     for term in more:
         variance = _increase(equations, columns.rows([term.name]), held, model.found.xy.sigma)
         lines.append(BudgetLine(
-            "xy", f"term {term.name}", "B", float("nan"), term.size, UNITS[term.name],
+            "xy", f"term {term.name}", "B", float("nan"), term.size, term.block.unit,
             float(np.sqrt(variance.mean())), float(np.sqrt(variance.max())), np.inf, "excluded"))
     return tuple(sorted((line for line in lines if line.effect_rms > MATTERS * u_rms),
                         key=lambda line: -line.effect_rms))

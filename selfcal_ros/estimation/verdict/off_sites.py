@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.blocks import AXES
 from selfcal_ros.estimation.joint.fit import fit
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.terms.columns import AXES, Column, ColumnBuilder
+from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.visits import ViewVisits
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.verdict import Cause

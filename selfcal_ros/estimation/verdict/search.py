@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.finer import finer
 from selfcal_ros.estimation.joint.model_fit import ModelFit
@@ -43,7 +44,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import ModelTerm, TermName, merged
+from selfcal_ros.model.terms import ModelTerm, merged
 from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 
 ALWAYS_SITES = 41 * 41
@@ -58,16 +59,6 @@ determine fully is ignored."""
 
 MAX_JOINED = 4
 """Largest number of terms added to the model because the readings show them."""
-
-START: dict[str, float] = {
-    TermName.MICROSCOPE: 1e-6, TermName.DRIFT: 1e-12, TermName.PLATE_SCALE: 1e-10,
-    TermName.PLATE_SHAPE: 1e-12, TermName.APPROACH: 1e-12, TermName.PLATE_STRAIN: 1e-10,
-    TermName.LINE_ECCENTRICITY: 1e-9, TermName.ROTATION: 1e-10,
-    TermName.YAW: 1e-9}
-"""Initial size of an added term: so small that the readings contradict it."""
-
-PLAUSIBLE = {TermName.MICROSCOPE: 0.1}
-"""Largest plausible size of a term: a larger one is a fault."""
 
 
 @dataclass(eq=False)
@@ -124,13 +115,14 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
               if test.contradicted and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
-    plausible = all(test.allowed <= PLAUSIBLE.get(test.name, np.inf) for test in tests)
-    alike = TermName.ROTATION in raised and _as_a_microscope(found, measurements, options)
+    plausible = all(test.allowed <= block_of(test.name).plausible for test in tests)
+    between = any(block_of(name).between for name in raised)
+    alike = between and _as_a_microscope(found, measurements, options)
     found.causes[:0] = [cause for cause in raised.values() if cause is not None]
     turned = turned_too_far(_model(solved), solved.result, measurements)
     if turned is not None:
         found.bounded = False
-        if TermName.ROTATION not in [cause.name for cause in found.causes]:
+        if turned.name not in [cause.name for cause in found.causes]:
             found.causes.append(turned)
     for rough in filter(None, (adequacy_of(_model(solved)), line_adequacy_of(_model(solved)))):
         found.effects.append(rough.effect(solved.result))
@@ -148,7 +140,8 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     if advise and found.causes:
         tried = found.terms and plausible and not alike
         model = _best_model(found, measurements, options) if tried else None
-        faulty = (TermName.DRIFT, READING, *([TermName.ROTATION] if turned else []))
+        faulty = (*(name for name, block in blocks().items() if block.of_time), READING,
+                  *([turned.name] if turned else []))
         found.causes = [_advised(cause, model, found.terms, faulty) for cause in found.causes]
     return found
 
@@ -192,7 +185,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
     used = {term.name: term for term in _model(searched.solved).problem.terms}
     best, least = None, np.inf
     for free in (True, False):
-        terms = [ModelTerm(TermName(name)) if free else used[TermName(name)].rounded_up
+        terms = [ModelTerm(name) if free else used[name].rounded_up
                  for name in searched.terms]
         tried = replace(options, terms=merged(options.terms, terms))
         if (solved := _uncontradicted(measurements, tried)) is not None:
@@ -240,7 +233,7 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
     left: list[Explanation] = []
     for _ in range(MAX_JOINED + 1):
         left = _explanations(found.solved, failed=failed)
-        first = [item for item in left if item.rank == 0 and item.name in START]
+        first = [item for item in left if item.rank == 0 and item.name in blocks()]
         if not first or not _join(found, first, measurements, options):
             break
         failed = False
@@ -297,6 +290,11 @@ def solved_with(measurements: Measurements, options: Options,
         return None
 
 
+def _hardly(name: str) -> ModelTerm:
+    """Return a term of a size that readings which show it contradict."""
+    return ModelTerm(name, block_of(name).undetected)
+
+
 def _join(found: SearchResult, first: list[Explanation], measurements: Measurements,
           options: Options) -> bool:
     """Add the first of equally good explanations to the model; the others enlarge u.
@@ -305,13 +303,13 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
     """
     ground = _model(found.solved).problem.ground
     names = [*found.terms, first[0].name]
-    solved = solved_with(measurements, options, [ModelTerm(TermName(n), START[n]) for n in names])
+    solved = solved_with(measurements, options, [_hardly(n) for n in names])
     if solved is None or not any(test.name == first[0].name and test.contradicted
                                  for test in _model(solved).sizes):
         return False
     for other in first[1:]:
         twin = solved_with(measurements, options, [
-            ModelTerm(TermName(n), START[n]) for n in (*found.terms, other.name)])
+            _hardly(n) for n in (*found.terms, other.name)])
         if twin is not None:
             found.effects.append(difference(other.name, twin.result, solved.result))
     found.causes += [cause_of(item, ground) for item in first]
@@ -333,7 +331,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
                    whole=little or test.rank == len(term.estimates))
     if not _counts(held, solved):
         return None
-    if test.name is TermName.ROTATION and abs(
+    if block_of(test.name).between and abs(
             (cause := cause_of(held, _model(solved).problem.ground)).size) > SURE * cause.u:
         return cause  # otherwise the readings do not determine which view it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
@@ -347,10 +345,10 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
     """
     known = next((term for term in options.model_terms(visits=True)
-                  if term.name is TermName.MICROSCOPE and not term.free), None)
+                  if term.block.of_offsets and not term.free), None)
     if known is None:
         return False
-    wider = known.scaled(max(PLAUSIBLE[TermName.MICROSCOPE] / known.size, 1.0))
+    wider = known.scaled(max(known.block.plausible / known.size, 1.0))
     twin = solved_with(measurements, options, [wider])
     if twin is None or any(test.contradicted for test in _model(twin).sizes):
         return False
@@ -368,7 +366,7 @@ def _bound(found: SearchResult, item: Explanation, measurements: Measurements) -
     """Add a cause outside the model, with its effect on the map as far as determined."""
     model = _model(found.solved)
     cause = cause_of(item, model.problem.ground)
-    if cause.name in [known.name for known in found.causes] and cause.name in START:
+    if cause.name in [known.name for known in found.causes] and cause.name in blocks():
         return
     found.causes.append(cause)
     found.bounded &= item.whole

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
@@ -14,7 +15,6 @@ from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
@@ -93,7 +93,9 @@ def terms_section(result: CalibrationResult) -> Section:
     """Return the estimates of the terms of the model."""
     rows = []
     for term in result.model.terms:
-        if term.name == TermName.YAW or (term.source == "default" and term.size_used is None):
+        block = blocks().get(term.name)
+        of_images = block is not None and block.of_images
+        if of_images or (term.source == "default" and term.size_used is None):
             continue  # part of the camera, or a line of the budget
         how = "free" if term.size is None else f"size {term.size:g}"
         if term.size_used is not None:

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.phrases import line_text
@@ -45,7 +45,8 @@ def unit_of(name: str, si: str) -> Unit:
 
     Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
     """
-    if name in (TermName.LINE_ECCENTRICITY, TermName.ROTATION, TermName.YAW):
+    block = blocks().get(name)
+    if block is not None and (block.of_lines or block.of_images):
         return URAD
     return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, Unit(1.0, si))
 
@@ -100,30 +101,30 @@ Words = Callable[[Any, dict[str, Any]], str]
 """A finding and its details -> its sentence."""
 
 _CAUSES: dict[str, Words] = {
-    TermName.MICROSCOPE: lambda c, of: _MICROSCOPE[of["part"]](c),
-    TermName.DRIFT: lambda c, of: (
+    "microscope": lambda c, of: _MICROSCOPE[of["part"]](c),
+    "drift": lambda c, of: (
         f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'"),
-    TermName.PLATE_SCALE: lambda c, of: (
+    "plate_scale": lambda c, of: (
         f"a plate {_either(c, 'larger', 'smaller')} by {plus_minus(c, RATIO)} in view '{c.view}' "
         f"than in view '{of['against']}'"),
-    TermName.PLATE_STRAIN: lambda c, of: (
+    "plate_strain": lambda c, of: (
         f"a plate {_STRAIN[of['part']](c)} by {plus_minus(c, RATIO)} in view '{c.view}' relative "
         f"to view '{of['against']}'"),
-    TermName.PLATE_SHAPE: lambda c, of: (
+    "plate_shape": lambda c, of: (
         f"a plate bent by {plus_minus(c, UM)} at the middle of an edge in view '{c.view}' relative "
         f"to view '{of['against']}'" + (
             "" if c.told else ", part of which cannot be separated from the stage")),
-    TermName.LINE_ECCENTRICITY: lambda c, of: (
+    "line_eccentricity": lambda c, of: (
         f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
         f"view '{c.view}'"),
-    TermName.YAW: lambda c, of: f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel",
-    TermName.APPROACH: lambda c, of: (
+    "yaw": lambda c, of: f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel",
+    "approach": lambda c, of: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"),
     "slip": lambda c, of: (
         f"a plate that slipped by {_slipped(of)} after about {of['after']:.0%} of view "
         f"'{c.view}'"),
-    TermName.ROTATION: lambda c, of: (
+    "rotation": lambda c, of: (
         f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
         f"relative to the marks in view '{c.view}'"),
     "reading": lambda c, of: (
@@ -141,17 +142,17 @@ _CAUSES: dict[str, Words] = {
         f"{c.size:.2f} times as much noise in view '{c.view}' as in the others")}
 
 _ACTIONS = {
-    TermName.MICROSCOPE: "align the microscope, or have the stage stop next to the marks "
+    "microscope": "align the microscope, or have the stage stop next to the marks "
                          "deliberately (check_stops)",
-    TermName.DRIFT: "visit the marks there and back",
-    TermName.PLATE_SCALE: "let the plate reach thermal equilibrium",
-    TermName.PLATE_SHAPE: "support the plate without strain",
-    TermName.PLATE_STRAIN: "support the plate without strain",
-    TermName.LINE_ECCENTRICITY: "centre the circle of lines on the axis of rotation in each view",
-    TermName.YAW: "declare a larger yaw:SIZE",
-    TermName.APPROACH: "approach each mark from the same side",
+    "drift": "visit the marks there and back",
+    "plate_scale": "let the plate reach thermal equilibrium",
+    "plate_shape": "support the plate without strain",
+    "plate_strain": "support the plate without strain",
+    "line_eccentricity": "centre the circle of lines on the axis of rotation in each view",
+    "yaw": "declare a larger yaw:SIZE",
+    "approach": "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
-    TermName.ROTATION: "check whether the plate moved between marks and lines, and the sign of "
+    "rotation": "check whether the plate moved between marks and lines, and the sign of "
                        "the lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
@@ -301,7 +302,29 @@ def remedies(cause: Cause) -> tuple[Remedy, ...]:
     """Return the remedies of a cause: models and views to try, and the action that removes it."""
     if any(remedy.kind == "action" for remedy in cause.remedies):
         return cause.remedies
-    return (*cause.remedies, Remedy("action", _ACTIONS[cause.name]))
+    return (*cause.remedies, Remedy("action", _action(cause.name)))
+
+
+def _action(name: str) -> str:
+    """Return what to do about a cause; of a block of another package as that says."""
+    block = blocks().get(name)
+    if name not in _ACTIONS and block is not None and block.action:
+        return block.action
+    return _ACTIONS.get(name, f"remove what causes it, or declare a larger {name}:SIZE")
+
+
+def _cause_words(cause: Cause) -> str:
+    """Return the sentence of a cause; of a block of another package its own, if that is there."""
+    if cause.name in _CAUSES:
+        return _CAUSES[cause.name](cause, cause.details)
+    block = blocks().get(cause.name)
+    if block is not None and block.sentence is not None:
+        return block.sentence(cause)
+    if not (cause.text or cause.unit):
+        raise KeyError(f"no words for {cause.name}")
+    where = f" in view '{cause.view}'" if cause.view else ""
+    return cause.text or (
+        f"an effect '{cause.name}' of {plus_minus(cause, unit_of(cause.name, cause.unit))}{where}")
 
 
 def advice(cause: Cause) -> str:
@@ -321,7 +344,7 @@ def what_it_is(cause: Cause) -> str:
         if "given" in cause.details:
             return _larger_term(cause, cause.details["given"])
         declared = ", declared to be exactly zero" * ("declared" in cause.details)
-        return _CAUSES[cause.name](cause, cause.details) + declared
+        return _cause_words(cause) + declared
     except (KeyError, TypeError, ValueError):
         if not cause.text:
             raise
@@ -329,7 +352,7 @@ def what_it_is(cause: Cause) -> str:
 
 
 def _larger_term(cause: Cause, given: float) -> str:
-    name = TermName(cause.name)
+    name = cause.name
     unit = unit_of(name, cause.unit)
     ratio = cause.size / given
     where = f" in view '{cause.view}'" if cause.view else ""

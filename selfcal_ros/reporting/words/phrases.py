@@ -10,7 +10,6 @@ from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.result import ViewResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
@@ -103,9 +102,9 @@ def line_text(line: BudgetLine) -> str:
 
 
 _EXCLUDED: dict[str, str] = {
-    TermName.PLATE_SHAPE: "bending that differs between views",
-    TermName.DRIFT: "drift during each view",
-    TermName.APPROACH: "difference between directions of approach"}
+    "plate_shape": "bending that differs between views",
+    "drift": "drift during each view",
+    "approach": "difference between directions of approach"}
 
 
 def excluded_text(line: BudgetLine) -> str:

@@ -11,7 +11,6 @@ from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
@@ -99,10 +98,10 @@ def budget_text(found: list[Budget]) -> list[str]:
 
 
 _CERTIFICATES: dict[str, str] = {
-    TermName.MICROSCOPE: "declare the microscope (--microscope), from a certificate of its scale",
-    TermName.PLATE_STRAIN: "declare a smaller plate_strain:SIZE, from support and temperature",
-    TermName.LINE_ECCENTRICITY: "declare a smaller line_eccentricity:SIZE, from a certificate",
-    TermName.YAW: "declare a smaller yaw:SIZE, from a measurement of the stage's angles"}
+    "microscope": "declare the microscope (--microscope), from a certificate of its scale",
+    "plate_strain": "declare a smaller plate_strain:SIZE, from support and temperature",
+    "line_eccentricity": "declare a smaller line_eccentricity:SIZE, from a certificate",
+    "yaw": "declare a smaller yaw:SIZE, from a measurement of the stage's angles"}
 """What removes a line of a plan's budget that no change of the plan removes."""
 
 

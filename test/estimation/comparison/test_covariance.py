@@ -20,7 +20,7 @@ from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import worded
 from test.support.lattice_plans import plan_of
@@ -68,7 +68,7 @@ def test_covariance_of_a_saved_map(sense, reference):
 def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
     readings = measured(TURNED, 1, sense=sense, missing=0.1)
     options = bare(reference=reference, terms=(
-        ModelTerm(TermName.PLATE_SCALE), ModelTerm(TermName.PLATE_SHAPE, 3e-8)))
+        ModelTerm("plate_scale"), ModelTerm("plate_shape", 3e-8)))
     result = calibrate(readings, options)
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
     known = result.error_map.valid

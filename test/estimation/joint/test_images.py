@@ -18,7 +18,7 @@ from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
@@ -258,8 +258,8 @@ def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
     _, measurements = measured(0.3 * MARK, 1155, size=7, **DISTORTED)
     assert calibrate(measurements).verdict.causes == ()
     equations = solve_joint(measurements, Options(
-        terms=(ModelTerm(TermName.APPROACH, 1e-8),))).model.equations
-    rows = equations.rows([TermName.APPROACH])
+        terms=(ModelTerm("approach", 1e-8),))).model.equations
+    rows = equations.rows(["approach"])
     share = np.diag(equations.information)[rows] / equations.norm[rows] ** 2
     assert np.abs(share).max() < 1e-14
 

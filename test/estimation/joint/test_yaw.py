@@ -12,7 +12,7 @@ from selfcal_ros.estimation.joint.camera import yaw_of
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.physics import between_sites
 from test.estimation.joint.test_images import MARK, datum, dense, measured, population, within
@@ -60,7 +60,7 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     _, measurements = measured(3 * MARK, 5, missing=missing, size=5, rotation="linear",
                                phi_rad=1e-5, t_m=1e-6, stage_yaw_rad=2e-5)
     solved = solve_joint(measurements, Options(
-        assumed=(), terms=(ModelTerm(TermName.YAW),), misalignment_model="linear",
+        assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear",
         at_places=False))
     matrix, stops = dense(measurements)
     matrix = np.hstack([matrix, of_yaw(measurements) / PITCH])
@@ -123,7 +123,7 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
     measurements = simulate_measurements(truth, plan, rng, settings=CellSettings(
         sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m))
     solved = solve_joint(measurements, Options(
-        assumed=(), terms=(ModelTerm(TermName.YAW),), misalignment_model="linear"))
+        assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear"))
     matrix, stops = dense(measurements)
     whole = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse, sites = np.linalg.pinv(whole, rcond=1e-10), np.prod(plan.artifact.shape)

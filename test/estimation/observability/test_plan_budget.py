@@ -13,7 +13,7 @@ from selfcal_ros.estimation.observability.plan_check import check_stops, predict
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.terms import DEFAULT_TERMS, ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, default_terms, in_order, parse_terms
 from selfcal_ros.model.view import Plan, View
 from test.support.dense_terms import SIGMA, Dense
 from test.support.plans import plan_of
@@ -35,7 +35,7 @@ def test_each_line_is_what_is_gained_if_its_term_is_known_as_well():
     found, dense = effects(budget_of(plan, TERMS, assumed)), Dense(plan, assumed)
     # terms are ordered by their name in the model, and each is added to those behind it
     named = {term.name: term for term in TERMS}
-    order = [named[name] for name in TermName if name in named]
+    order = in_order(named.values())
     gains = [SIGMA * dense.gain(tuple(order[at:])) for at in range(len(order) + 1)]
     assert found.pop(NOISE) == pytest.approx(gains[-1], rel=1e-6)
     for term, more, less in zip(order, gains, gains[1:], strict=False):
@@ -101,8 +101,8 @@ def dense_lines(sizes, sigma):
 
 def test_the_lines_have_a_budget_of_their_own():
     sizes, sigma = (3e-6, 2e-6), 4e-6
-    terms = (ModelTerm(TermName.LINE_ECCENTRICITY, sizes[0]),
-             ModelTerm(TermName.ROTATION, sizes[1]))
+    terms = (ModelTerm("line_eccentricity", sizes[0]),
+             ModelTerm("rotation", sizes[1]))
     # marks so good that they tell the rotations
     found = budget_of(LINES, terms, Assumed(1e-12, sigma_rad=sigma))
     assert found.u_rms("theta") == pytest.approx(dense_lines(sizes, sigma), rel=1e-3)
@@ -116,10 +116,10 @@ def test_the_lines_have_a_budget_of_their_own():
 def test_a_removal_leaves_what_it_says():
     plan = plan_of("0, 90, tx", 7, repeats=2)
     assumed = Assumed(1e-9, turn_rad=3e-4)
-    found = budget_of(plan, DEFAULT_TERMS, assumed)
+    found = budget_of(plan, default_terms(), assumed)
     removal = found.removals["xy", "microscope"]
     assert removal.kind == "check_stops"
-    with_it = budget_of(replace(plan, views=removal.step.views), DEFAULT_TERMS, assumed)
+    with_it = budget_of(replace(plan, views=removal.step.views), default_terms(), assumed)
     assert removal.effect_rms == pytest.approx(effects(with_it)["microscope"], rel=1e-9)
     assert removal.effect_rms < module.REMOVED * effects(found)["microscope"]
     # strain of its own in each view is told by no single view more
@@ -140,7 +140,7 @@ def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     sizes = []
     monkeypatch.setattr(module, "effects_of_terms", lambda plan, *more: (
         sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1])
-    found = budget_of(plan_of("0, 90, tx", 15), DEFAULT_TERMS, Assumed(1e-9))
+    found = budget_of(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
     assert sizes[0] == (15, 15) and set(sizes[1:]) == {(11, 11)}
-    before = effects_of_terms(plan_of("0, 90, tx", 15), DEFAULT_TERMS, Assumed(1e-9))
+    before = effects_of_terms(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
     assert effects(found)["microscope"] == pytest.approx(np.sqrt(before["microscope"][0].mean()))

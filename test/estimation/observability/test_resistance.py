@@ -11,11 +11,11 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.normal.systems import planned_system
 from selfcal_ros.estimation.observability import resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
-from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms
+from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms, nominal_sizes
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import NOMINAL_SIZES, ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.view import ORDERS, View
 from selfcal_ros.model.visit_order import visit_sequence
 from test.support.dense_terms import SIGMA, Dense
@@ -40,10 +40,10 @@ def both(order, sense=Sense.MICROSCOPE_MOVES, degree=3):
 
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("order", [*ORDERS, "raster@plate"])
-@pytest.mark.parametrize("name", NOMINAL_SIZES)
+@pytest.mark.parametrize("name", nominal_sizes())
 def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     planned, dense = both(order, sense)
-    size = {TermName.MICROSCOPE: 1e-4}.get(name, NOMINAL_SIZES[name])
+    size = {"microscope": 1e-4}.get(name, nominal_sizes()[name])
     found = planned.check(name, size, LEVEL)
     assert found.unseen_modes == dense.n_unseen([ModelTerm(name)])
     assert found.told is (found.unseen_modes == 0)
@@ -60,7 +60,7 @@ UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
 """A plate of 5 x 3 marks, and views of unlike repeats."""
 
 
-@pytest.mark.parametrize("name", NOMINAL_SIZES)
+@pytest.mark.parametrize("name", nominal_sizes())
 @pytest.mark.parametrize("size", ["", ":1e-7"], ids=["free", "sized"])
 def test_columns_are_as_long_as_those_of_all_visits(name, size):
     """Means of marks and visits about them hold together what every visit has."""
@@ -89,7 +89,7 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
         unit = min(view.repeats for view in plan.views) ** 0.5
         assert planned.predicted(alone).rms_xy == pytest.approx(dense.gain(model) * unit, rel=1e-6)
         assert alone.rms_xy == pytest.approx(dense.gain([]) * unit, rel=1e-9)
-    sizes = NOMINAL_SIZES | {TermName.MICROSCOPE: 1e-4}
+    sizes = nominal_sizes() | {"microscope": 1e-4}
     for found in check_terms(planned, sizes, LEVEL):
         others = [term for term in model if term.name != found.name]
         held = [term for term in others if term.free]
@@ -119,9 +119,9 @@ def test_what_a_drift_hides_depends_on_the_visiting_order(order, repeats):
     assert alone.rms_xy == pytest.approx(0.843, abs=5e-4)
     row = []
     for degree in (1, 2, 3, 5):
-        planned = PlannedTerms(plan, [ModelTerm(TermName.DRIFT)],
+        planned = PlannedTerms(plan, [ModelTerm("drift")],
                                Assumed(SIGMA, 10e-6, degree, order))
-        hidden = planned.check(TermName.DRIFT, 1e-8, LEVEL).unseen_modes
+        hidden = planned.check("drift", 1e-8, LEVEL).unseen_modes
         row.append(hidden or round(planned.predicted(alone).rms_xy, 3))
     assert tuple(row) == pytest.approx(ORDER_TABLE[order, repeats], abs=1e-9)
 
@@ -144,7 +144,7 @@ def test_shifts_of_both_signs_damp_bent_plates():
     """Plates bent by 10 nm in each view: both shifts take most of it off the map."""
     def effect(text):
         return PlannedTerms(plan_of(text, 11), (), Assumed()).check(
-            TermName.PLATE_SHAPE, 10e-9, LEVEL).effect_rms_m
+            "plate_shape", 10e-9, LEVEL).effect_rms_m
 
     one_sided, both_sides = effect("0, 90, tx"), effect("0, 90, tx, -tx, ty, -ty")
     assert both_sides < 0.5 * one_sided
@@ -193,9 +193,9 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
 
 def test_a_power_is_the_rate_of_drawn_tests():
     """No term at all: the test finds one as often as its level says."""
-    found = PlannedTerms(SMALL, (), Assumed()).check(TermName.APPROACH, 1e-15, 0.05)
+    found = PlannedTerms(SMALL, (), Assumed()).check("approach", 1e-15, 0.05)
     assert found.power == pytest.approx(0.05, abs=5 * (0.05 * 0.95 / resistance.DRAWS) ** 0.5)
-    assert PlannedTerms(SMALL, (), Assumed()).check(TermName.APPROACH, 1e-5, 0.05).power == 1.0
+    assert PlannedTerms(SMALL, (), Assumed()).check("approach", 1e-5, 0.05).power == 1.0
 
 
 def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
@@ -209,8 +209,8 @@ def test_a_shift_along_a_diagonal_tells_bent_plates_from_the_stage():
     plan = plan_of("0, 90, tx, -tx, ty, -ty", 5)
     corner = View("corner", 0.0, (0.01, 0.01), True, False)
     found = [PlannedTerms(replace(plan, views=views), (), Assumed()).check(
-        TermName.PLATE_SHAPE, 1e-8, LEVEL).unseen_modes
+        "plate_shape", 1e-8, LEVEL).unseen_modes
         for views in (plan.views, (*plan.views, corner))]
     assert found == [1, 0]
     assert Dense(replace(plan, views=(*plan.views, corner)), Assumed()).n_unseen(
-        [ModelTerm(TermName.PLATE_SHAPE)]) == 0
+        [ModelTerm("plate_shape")]) == 0

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.quality.residuals import (
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import OUTLIER, GridVisits, Sense, ViewReadings, subset, without
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.outputs import plain
@@ -201,7 +201,7 @@ def test_a_turned_microscope_is_no_slip():
     assert result.verdict.grade is not Grade.GOOD
     assert result.verdict.causes[0].name == "microscope"
     assert "no view was split" in " ".join(worded(result).warnings)
-    with_term = replace(LINEAR, terms=(ModelTerm(TermName.MICROSCOPE),))
+    with_term = replace(LINEAR, terms=(ModelTerm("microscope"),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})
     bad = replace(bad, views=tuple(
         view if view.visits is None else replace(view, visits=replace(view.visits, dx=view.dx))

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.quality import prediction, validation
 from selfcal_ros.estimation.quality.prediction import HeldReadings, PredictionLimit, noise_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from test.support.lattice_plans import plan_of
 from test.support.options import bare
 from test.support.truth import random_truth, simulate_measurements
@@ -68,7 +68,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     readings = with_visits(simulate_measurements(random_truth(
         plan.artifact, len(plan.views), rng), plan, rng, linear=True, sigma_m=UNIT_M, visits=True),
         rng)
-    terms = [ModelTerm(TermName.MICROSCOPE), *[ModelTerm(TermName.DRIFT)] * of_view]
+    terms = [ModelTerm("microscope"), *[ModelTerm("drift")] * of_view]
     options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1,
                    at_places=False)
     seen = []

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.quality.validation import (
 )
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import held_out_text, worded
 from selfcal_ros.reporting.words.tables import validation_json, validation_text, why_text
@@ -185,7 +185,7 @@ def test_terms_are_predicted_with_the_readings(few_draws):
         views.append(replace(view, dx=visits.dx[np.argsort(visits.mark)],
                              dy=visits.dy[np.argsort(visits.mark)], visits=visits))
     readings = replace(readings, views=tuple(views))
-    terms = (ModelTerm(TermName.MICROSCOPE), ModelTerm(TermName.DRIFT))
+    terms = (ModelTerm("microscope"), ModelTerm("drift"))
     found = validate(readings, replace(LINEAR, terms=terms, drift_degree=1), folds=2)
     tenths, whole = found[:2], found[2]
     for item in tenths:
@@ -202,7 +202,7 @@ def test_terms_are_predicted_with_the_readings(few_draws):
 def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch):
     """Its own strain is unknown and as large as its size: one in twenty exceeds a limit of 5 %."""
     monkeypatch.setattr(prediction, "PREDICTION_LEVEL", 0.05)
-    strained = bare(terms=(ModelTerm(TermName.PLATE_STRAIN, 5e-6),))
+    strained = bare(terms=(ModelTerm("plate_strain", 5e-6),))
     spread = Spread(plate_strain=5e-6)
     found = [item for seed in range(8) for item in validate(
         drawn(seed, SMALL, spread=spread), strained, folds=1)
@@ -220,7 +220,7 @@ def test_lines_are_predicted_with_the_eccentricity_of_their_view(sense, few_draw
     truth = random_truth(plan.artifact, 4, rng, Spread(line_eccentricity_rad=15e-6))
     readings = simulate_measurements(truth, plan, rng, sense=sense, sigma_m=SIGMA_M,
                                      sigma_theta_rad=2e-8)
-    model = bare(terms=(ModelTerm(TermName.LINE_ECCENTRICITY, 15e-6),))
+    model = bare(terms=(ModelTerm("line_eccentricity", 15e-6),))
     for item in validate(readings, model, folds=2)[:2]:
         assert 1e-8 < item.rms_rad < 1e-7
     assert validate(readings, BARE, folds=1)[0].rms_rad > 5e-6

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
@@ -23,7 +23,7 @@ from test.support.results import covered
 NOISE, OFFSET, MARKS, REPEATS = 20e-9, 20e-6, 5, 5
 MACHINE = Spread(phi_rad=5e-5, t_m=5e-6, microscope_scale=0.01, microscope_rotation_rad=5e-3,
                  microscope_shear=2e-3)
-FREE = bare(terms=(ModelTerm(TermName.MICROSCOPE),))
+FREE = bare(terms=(ModelTerm("microscope"),))
 
 
 def measured(sense, *, marks=MARKS, seed=1, **settings):

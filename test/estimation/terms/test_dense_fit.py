@@ -13,7 +13,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import DEFAULT_TERMS, parse_terms
+from selfcal_ros.model.terms import default_terms, parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -25,7 +25,7 @@ DEGREE = 2
 QUIET = {"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "stop_sigma_m": 20e-6}
 MODELS = {
     "none": "",
-    "assumed": ",".join(map(str, DEFAULT_TERMS)),
+    "assumed": ",".join(map(str, default_terms())),
     "sized": "microscope:0.01:0.02:0.001,drift:5e-8,plate_scale:3e-7,plate_shape:2e-8,"
              "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6,rotation:1e-6",
     "free": "microscope,drift,plate_scale,approach,rotation",
@@ -144,7 +144,7 @@ def test_a_model_as_the_dense_matrix_has_it(plan, model, sense):
 @pytest.mark.parametrize("model", ["none", "free"])
 def test_nothing_more_is_assumed_of_a_linear_model(model):
     require_same(*both(measured("lines", model), model, misalignment_model="linear",
-                       assumed=DEFAULT_TERMS))
+                       assumed=default_terms()))
 
 
 @pytest.mark.parametrize("sense", Sense)

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.model.error_map import datum_modes, remove_modes
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import placings_of, with_sub_views
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.simulation.machine import Spread
@@ -37,7 +37,8 @@ def measured(seed=1, plan=PLAN, strain=0.0):
 
 def columns_of(measurements, name, size):
     problem, _ = prepare(measurements, BARE)
-    return problem.ground, term_columns(problem.ground, [ModelTerm(name, size)], 2)
+    ground = replace(problem.ground, drift_degree=2)
+    return ground, term_columns(ground, [ModelTerm(name, size)])
 
 
 def test_cells_belong_to_the_placing_of_their_view():
@@ -46,8 +47,8 @@ def test_cells_belong_to_the_placing_of_their_view():
 
 
 @pytest.mark.parametrize(("name", "size", "count"), [
-    (TermName.PLATE_STRAIN, 1e-6, 6), (TermName.PLATE_STRAIN, np.inf, 3),
-    (TermName.PLATE_SHAPE, 1e-8, 12), (TermName.DRIFT, 1e-8, 8)])
+    ("plate_strain", 1e-6, 6), ("plate_strain", np.inf, 3),
+    ("plate_shape", 1e-8, 12), ("drift", 1e-8, 8)])
 def test_a_placing_has_its_columns_in_all_cells(name, size, count):
     ground, columns = columns_of(measured()[1], name, size)
     assert len(columns.columns) == count
@@ -62,7 +63,7 @@ def test_a_placing_has_its_columns_in_all_cells(name, size, count):
 def test_marks_of_one_image_have_one_time():
     """The first and the last exposure of the placing are its ends, not those of each cell."""
     _, measurements = measured()
-    ground, _ = columns_of(measurements, TermName.DRIFT, 1e-8)
+    ground, _ = columns_of(measurements, "drift", 1e-8)
     times = {}
     for row, visits in enumerate(ground.visits[:9]):
         stamps = measurements.views[row].visits.stamp_ns
@@ -74,7 +75,7 @@ def test_marks_of_one_image_have_one_time():
 
 def test_u_holds_a_strain_that_all_cells_share():
     """Errors over u in 30 machines: six coefficients each, so that their rms scatters by 10 %."""
-    term, z = ModelTerm(TermName.PLATE_STRAIN, 1e-5), []
+    term, z = ModelTerm("plate_strain", 1e-5), []
     for seed in range(30):
         truth, measurements = measured(seed, strain=1e-5)
         emap = calibrate(measurements, bare(terms=(term,), causes=False)).error_map
@@ -86,7 +87,7 @@ def test_u_holds_a_strain_that_all_cells_share():
 
 def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing():
     _, measurements = measured(strain=1e-5)
-    found = validate(measurements, bare(terms=(ModelTerm(TermName.PLATE_STRAIN, 1e-5),)))
+    found = validate(measurements, bare(terms=(ModelTerm("plate_strain", 1e-5),)))
     assert not [item for item in found if item.exceeds]
     assert max(item.ratio for item in found if np.isfinite(item.ratio)) < 2
 
@@ -95,6 +96,6 @@ def test_views_without_images_are_placings_of_their_own():
     plan = replace(plan_of("0, 90, tx", 5, count=0), views=tuple(
         replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views))
     _, measurements = measured(plan=plan)
-    ground, columns = columns_of(measurements, TermName.PLATE_STRAIN, 1e-6)
+    ground, columns = columns_of(measurements, "plate_strain", 1e-6)
     assert [column.view for column in columns.columns] == [0] * 3 + [1] * 3 + [2] * 3
     assert ground.members == {0: [0], 1: [1], 2: [2]}

@@ -13,7 +13,7 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade, Remedy
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
@@ -49,7 +49,7 @@ def turned(readings, index, by_rad):
 
 def apart(size_rad=1e-12, **how):
     """Options with lines that turn against marks by themselves, by so much or as they like."""
-    return bare(terms=(ModelTerm(TermName.ROTATION, size_rad),), **how)
+    return bare(terms=(ModelTerm("rotation", size_rad),), **how)
 
 
 def probability(readings):

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.reporting.summary.sections import error_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -50,7 +50,7 @@ def test_the_effect_is_what_the_declared_term_adds_to_u():
     readings = measured()
     line = excluded(readings)["plate_shape"]
     without, declared = (calibrate(readings, options).error_map for options in (
-        BARE, bare(terms=(ModelTerm(TermName.PLATE_SHAPE, SIZE_M),))))
+        BARE, bare(terms=(ModelTerm("plate_shape", SIZE_M),))))
     more = (np.stack([declared.u_gx, declared.u_gy]) ** 2
             - np.stack([without.u_gx, without.u_gy]) ** 2)
     assert line.u == SIZE_M and line.unit == "m" and line.source == "excluded"
@@ -80,7 +80,7 @@ def test_an_order_that_hides_a_drift_is_stated():
 
 @pytest.mark.parametrize("size", [0.0, 30e-9, np.inf])
 def test_what_is_declared_is_not_excluded(size):
-    term = ModelTerm(TermName.DRIFT, size)
+    term = ModelTerm("drift", size)
     found = excluded(measured(), bare(terms=(term,)))
     assert "drift" not in found and "plate_shape" in found
 

@@ -12,7 +12,7 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.explanations import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.terms import TermName, parse_terms
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
@@ -209,9 +209,9 @@ def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
 
 def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
     found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
-    columns = [Column(TermName.DRIFT, view, part, np.inf) for view, part in found]
+    columns = [Column("drift", view, part, np.inf) for view, part in found]
     tried = [[found[at] for at in group.rows]
-             for group in _groups(columns, [TermName.APPROACH, TermName.DRIFT])]
+             for group in _groups(columns, ["approach", "drift"])]
     assert tried == [found, *(rows for view in range(3) for rows in (
         [one for one in found if one[0] == view],
         [one for one in found if one[0] == view and one[1] != "x P2"]))]

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.verdict.judge import judged, provenance_of
 from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -51,7 +51,7 @@ def test_axis_conditions_that_nobody_asked_for_hold(readings):
     assert solve_joint(readings, linear).axes == (1.0, 0.0)
 
 
-@pytest.mark.parametrize("terms", [(), (ModelTerm(TermName.PLATE_SCALE, 1e-9),)])
+@pytest.mark.parametrize("terms", [(), (ModelTerm("plate_scale", 1e-9),)])
 def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(readings, terms):
     """The rotary encoder owes nothing to the axes: its map in their datum is wrong."""
     options = Options(misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES, terms=terms)

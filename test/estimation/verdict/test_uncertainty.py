@@ -21,7 +21,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import ModelTerm, TermName
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.reporting.words.findings import worded
 from test.support.options import bare
 from test.support.truth import hu_plan, random_truth, simulate_measurements
@@ -34,8 +34,8 @@ def result():
     plan, rng = hu_plan(Artifact(5, 0.01, 8), repeats=2), np.random.default_rng(2)
     truth = random_truth(plan.artifact, 4, rng)
     return calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
-                     bare(terms=(ModelTerm(TermName.PLATE_STRAIN, 2e-7),
-                                 ModelTerm(TermName.LINE_ECCENTRICITY, 1e-6))))
+                     bare(terms=(ModelTerm("plate_strain", 2e-7),
+                                 ModelTerm("line_eccentricity", 1e-6))))
 
 
 def effects_of(result):

@@ -14,7 +14,7 @@ from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.terms import ModelTerm, TermName, parse_terms
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import budget_text, quantity_text
@@ -104,7 +104,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     truth = random_truth(artifact, 5, rng)
     readings = simulate_measurements(truth, plan, rng, sigma_m=2e-8)
     plain = bare(datum_theta="zero_mean", causes=False)
-    with_term = replace(plain, terms=(ModelTerm(TermName.PLATE_SHAPE, 1e-7),))
+    with_term = replace(plain, terms=(ModelTerm("plate_shape", 1e-7),))
     alone, result = calibrate(readings, plain), calibrate(readings, with_term)
     parts = parts_of(budgets(result)[0])
     emap = result.error_map
@@ -117,7 +117,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     assert line.effect_rms > 0.2 * noise
     assert line_text(line).startswith("size 1e-07, of which the readings leave ")
     loose = parts_of(budgets(calibrate(readings, replace(plain, terms=(
-        ModelTerm(TermName.PLATE_SHAPE, 1e-9),))))[0])["term plate_shape"]
+        ModelTerm("plate_shape", 1e-9),))))[0])["term plate_shape"]
     assert (loose.kind, loose.dof) == ("B", np.inf) and loose.effect_rms < line.effect_rms
 
 

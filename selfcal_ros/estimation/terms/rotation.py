@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotation: the plate turns between the marks and the lines of a view; Vtheta has r."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.blocks import Block, Located, Pattern
+from selfcal_ros.estimation.terms.visits import TermInputs
+from selfcal_ros.model.terms import ModelTerm
+
+
+def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
+    """Yield the turn of each view of marks and lines; free ones are relative to the first."""
+    for view in inputs.with_lines[int(term.free):]:
+        values = np.zeros((len(inputs.line_names), inputs.n_lines))
+        values[view] = 1.0
+        yield Pattern((("turn", 1),), view=view, lines=values)
+
+
+def located(found: Any, names: tuple[str, ...]) -> Located:
+    """Yield the view that differs most from all others: a common rotation belongs to the datum."""
+    n, unit = len(found.values), np.eye(len(found.values))
+    apart = []
+    for at in range(n):
+        others = [unit[at] - unit[other] for other in range(n) if other != at]
+        apart.append(min((abs(found.values @ weights) / _u(found, weights) for weights in others),
+                         default=0.0))
+    at = int(np.argmax(apart))
+    weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
+    # u is that of the difference from the nearest
+    nearest = abs(float(found.values @ weights)) / max(apart[at], 1e-300)
+    yield {"view": names[found.columns[at].view], "u": max(_u(found, weights), nearest)}, weights
+
+
+def _u(found: Any, weights: np.ndarray) -> float:
+    """Return the standard uncertainty of weights @ values, at least the least number."""
+    return max(float(np.sqrt(max(weights @ found.covariance @ weights, 0.0))), 1e-300)
+
+
+BLOCK = Block(
+    "rotation", "rad", patterns, undetected=1e-10,
+    sizes=(1e-7,),  # 5 nm at a radius of 50 mm
+    of_lines=True, between=True, located=located, cure="read lines in more views with marks")
