@@ -9,7 +9,7 @@ import pytest
 
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-BASE = {"errors": set(), "topics": set(), "units": set(), "start": set(),
+BASE = {"blocks": {"errors"}, "errors": set(), "topics": set(), "units": set(), "start": set(),
         "outputs": {"errors"}, "files": {"errors", "outputs"},
         "results": {"files", "model"}}
 """Modules that any package may import (`start`: the edges), and what they import."""

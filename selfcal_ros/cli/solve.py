@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
+from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.cli.terminal import (
     add_json,
     add_parameters,
@@ -42,6 +43,7 @@ from selfcal_ros.model.result import (
     unidentified_result,
     with_input,
 )
+from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import excluded_text, recheck_lines
@@ -88,8 +90,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         "marks marks:ID:ID:LENGTH:U")
     add_parameters(parser, SolverSettings, REFERENCE)
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
-                        help="terms estimated with the map: microscope, drift, plate_scale, "
-                        "plate_shape, approach, plate_strain, line_eccentricity, rotation, yaw; "
+                        help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
                         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
                         "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
                         "terms, not even those assumed by default (docs/estimation.md)")
@@ -122,11 +123,13 @@ def _model(args: argparse.Namespace) -> list[str] | None:
     if args.microscope is None:
         return args.model
     sizes = args.microscope.split(":")
-    declared = ":".join(["microscope", *sizes, *("0.01", "0.01", "0.002")[len(sizes):]])
-    if len(sizes) > 3 or any("microscope" in text or text == "none" for text in args.model or ()):
+    usual = microscope_term()
+    missing = [f"{size:g}" for size in usual.parts[len(sizes):]]
+    if len(sizes) > len(usual.parts) or any(
+            usual.name in text or text == "none" for text in args.model or ()):
         raise InputError("--microscope", f"'{args.microscope}' does not fit",
                          "give up to three sizes, and no microscope or none in --model")
-    return [*(args.model or ()), declared]
+    return [*(args.model or ()), ":".join([usual.name, *sizes, *missing])]
 
 
 def _reference(text: str | None) -> dict[str, Any]:

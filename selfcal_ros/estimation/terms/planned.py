@@ -107,7 +107,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
                   placing_names=tuple(view.plan_view for view in grid_views),
                   yaw=stage_yaw(artifact, grid_views),
-                  drift_degree=assumed.drift_degree)
+                  drift_degree=assumed.drift_degree,
+                  poses=tuple(view.pose for view in grid_views))
 
 
 def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,

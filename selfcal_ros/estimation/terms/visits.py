@@ -19,6 +19,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import Pose
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE
 from selfcal_ros.model.view import View, placings_of
@@ -307,6 +308,9 @@ class TermInputs:
         How images depend on the yaw of the stage; None without images.
     drift_degree : int
         Degree of the polynomial of a view's time that a block may have.
+    poses : tuple of Pose
+        Nominal pose of the plate in each view: `shift_m`, where its centre lies on the stage, and
+        `phase`, from its frame to the stage's.
     """
 
     z: np.ndarray
@@ -322,6 +326,12 @@ class TermInputs:
     placing_names: tuple[str, ...] = ()
     yaw: StageYaw | None = None
     drift_degree: int = DRIFT_DEGREE
+    poses: tuple[Pose, ...] = ()
+
+    def on_stage(self, view: int) -> np.ndarray:
+        """Return the nominal places of all marks in a view, stage axes, complex (marks,), m."""
+        pose = self.poses[view]
+        return complex(*pose.shift_m) + pose.phase * self.z.reshape(-1) * self.half_width_m
 
     def at_visits(self, values_of: Callable[[ViewVisits], np.ndarray],
                   views: Iterable[int] | None = None, *, nominal: bool = False
@@ -398,7 +408,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
                       stage_yaw(measurements.artifact, views) if measurements.has_images else None,
-                      drift_degree)
+                      drift_degree, tuple(view.pose for view in views))
 
 
 def without_noise(ground: TermInputs, residuals: np.ndarray,

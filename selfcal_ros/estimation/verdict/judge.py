@@ -311,7 +311,7 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
     known = {term.name for term in (*options.terms, *problem.terms)}
     visited = all(visits is not None for visits in problem.ground.visits)
     more = [ModelTerm(block.name, block.nominal) for block in blocks().values()
-            if block.nominal and not {block.name, block.part_of} & known
+            if block.nominal and not (block.sizes or block.part_of or block.name in known)
             and (visited or not block.needs_visits)]
     columns = term_columns(problem.ground, (*problem.terms, *more))
     equations = equations_of(problem, model.found, columns)
