@@ -17,6 +17,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -258,7 +259,8 @@ def main() -> int:
     for row in measure_compensation(args.compensate) if args.compensate else ():
         rows.append(row)
         (show if row["seconds"] is None else compensate.show)(row)
-    for row in detecting.rows(args.images) if args.images else ():
+    detected = chain(detecting.rows(args.images), detecting.rows_of_many())
+    for row in detected if args.images else ():
         rows.append(row)
         (show if row["seconds"] is None else detecting.show)(row)
     Path(args.output).parent.mkdir(parents=True, exist_ok=True)
