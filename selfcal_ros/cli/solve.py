@@ -107,7 +107,8 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
     collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
     solver = node_settings(args.params, SolverSettings, model_terms=_model(args),
                            **given(args, METHOD | REFERENCE | TERMS), **_reference(args.reference))
-    for option in ("certificate", "reference_at"):
+    of_plate = {"reference_at"} if getattr(args, "plate_from", "") else set()
+    for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":
             raise InputError(f"--{option.replace('_', '-')}",
                              "it belongs to a reference length, and none is given",

@@ -70,7 +70,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         raise InputError("method law", "Hu's law cannot use images of several marks",
                          "solve with --method joint")
     if options.plate is not None:
-        plate = known_plate(options.plate, options.plate_from)
+        plate = known_plate(options.plate, options.plate_from, options.plate_at)
         return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
     if camera is not None:  # the microscope that images show, in place of the assumed one

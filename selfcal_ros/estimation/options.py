@@ -208,6 +208,8 @@ class Options:
         Calibration that made the plate known: its map is given, and the stage's is rechecked.
     plate_from : str
         Its file, for messages.
+    plate_at : str
+        Temperature of the known plate, as for `ReferenceLength.at_temperature`; empty = not known.
 
     Raises
     ------
@@ -230,6 +232,7 @@ class Options:
     robust: bool = False
     plate: CalibrationResult | None = None
     plate_from: str = ""
+    plate_at: str = ""
 
     def __post_init__(self) -> None:
         """Fill in the model of the method; refuse unknown names."""

@@ -50,12 +50,11 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
 def _require_temperature(result: CalibrationResult, conditions: list[dict[str, Any]]) -> None:
     """Refuse a temperature of the plate that contradicts the one of its reference length.
 
-    It may differ in a recheck, whose reference length is that of the plate's calibration, and
-    between the runs of a mean.
+    It may differ between the runs of a mean.
     """
     reference = result.reference or {}
     known = reference.get("certified")
-    if not known or "runs" in reference or RECHECK in result.extra:
+    if not known or "runs" in reference:
         return
     if reference["kind"].startswith("stage"):
         return
@@ -114,13 +113,14 @@ def scale_texts(result: CalibrationResult) -> list[str]:
     """Return what sets the scale of a map, and whether it is traceable."""
     reference = result.reference
     if not reference:
-        return ["The scale of the map is a convention, relative to the encoders: no reference "
-                "length was used. Form, straightness and squareness do not depend on a reference."]
+        why = ("the temperature of the known plate in this measurement was not stated"
+               if RECHECK in result.extra else "no reference length was used")
+        return [f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
+                "straightness and squareness do not depend on a reference."]
     texts = []
     if RECHECK in result.extra:
-        texts.append("The scale is that of the known plate, set at its calibration as follows. The "
-                     "expansion of the plate since then is not corrected: the temperature of this "
-                     "measurement is among the influence conditions.")
+        texts.append("The scale is that of the known plate, set at its calibration and converted "
+                     "to the temperature of this measurement as follows.")
     for found in reference.get("runs", [reference]):
         texts.append(f"The scale is set by a reference length ({reference_name(found)}): relative "
                      f"error {found['relative_error']:.4g}, standard uncertainty "

@@ -510,7 +510,8 @@ def rechecked():
     before = replace(before, input={"file": "plate.mcap", "sha256": "0123abcd"})
     view = replace(plan, plan_id="again", views=plan.views[:1])
     readings = simulate_measurements(truth, view, rng, sigma_m=2e-8)
-    plate = known_plate(result_from_dict(result_to_dict(before), "r"), "there/r.json")
+    plate = known_plate(result_from_dict(result_to_dict(before), "r"), "there/r.json",
+                        "20.4:.1:5e-7:5e-8")
     return before, worded(recheck(readings, Options(), plate))
 
 

@@ -118,6 +118,7 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
                    terms=terms, terms_from=origin if terms else "", assumed=assumed,
                    drift_degree=settings.drift_degree, plate_from=plate_from,
                    plate=read_result(plate_from) if plate_from else None,
+                   plate_at=settings.reference_at if plate_from else "",
                    magnification_limit=settings.magnification_limit,
                    robust=settings.robust)
 

@@ -24,6 +24,7 @@ from selfcal_ros.estimation.comparison.maps import (
 from selfcal_ros.estimation.comparison.together import Together, together
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.placed import MapSpline
+from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.recheck.detection import ChangeTests
 from selfcal_ros.estimation.recheck.views import Gain
 from selfcal_ros.model.artifact import Artifact, Interpolation
@@ -46,17 +47,56 @@ class KnownPlate:
         What it knows of stage and plate together.
     where : str
         Its file, for messages.
+    reference : dict or None
+        Reference length of the calibration at the temperature of the plate now; None if that
+        temperature or the length is not known: then no map has a scale.
     """
 
     result: CalibrationResult
     kept: Together
     where: str
+    reference: dict[str, Any] | None = None
 
     @property
     def field(self) -> np.ndarray:
-        """Error of the plate, complex (nx, ny), m; NaN where unknown."""
-        plate = self.result.artifact_map
-        return np.where(self.kept.marks, plate.ax + 1j * plate.ay, complex(np.nan, np.nan))
+        """Error of the plate now, complex (nx, ny), m; NaN where unknown.
+
+        With the expansion since its calibration, where the temperatures of both are known.
+        """
+        plate, lattice = self.result.artifact_map, self.result.plate
+        longer = 0.0
+        if self.reference is not None and self.result.reference is not None:
+            longer = self.reference["relative_error"] - self.result.reference["relative_error"]
+        nominal = lattice.x_m + 1j * lattice.y_m
+        return np.where(self.kept.marks, plate.ax + 1j * plate.ay + longer * nominal,
+                        complex(np.nan, np.nan))
+
+    @property
+    def variance_of_length(self) -> float:
+        """Variance of the plate's length now beyond that at its calibration, 1 = (m/m)^2."""
+        if self.reference is None or self.result.reference is None:
+            return 0.0
+        now, then = (each["u_relative"] for each in (self.reference, self.result.reference))
+        return max(now**2 - then**2, 0.0)
+
+    @property
+    def variance_of_expansion(self) -> float:
+        """Variance of the expansion since the calibration, by both temperatures, (m/m)^2."""
+        if self.reference is None or self.result.reference is None:
+            return 0.0
+        now, then = (each["certified"] for each in (self.reference, self.result.reference))
+        u_kelvin = np.hypot(now["u_temperature_k"], then["u_temperature_k"])
+        warmer = now["temperature_c"] - then["temperature_c"]
+        return float((now["expansion_per_k"] * u_kelvin)**2
+                     + (warmer * now["u_expansion_per_k"])**2)
+
+    def length_at(self, marks: np.ndarray) -> np.ndarray:
+        """Return what a relative expansion of 1 adds to Ax, Ay of marks, and to the microscope.
+
+        Of the marks in a bool array (nx, ny): (2 m + 4,), m.
+        """
+        lattice = self.result.plate
+        return np.concatenate([lattice.x_m[marks], lattice.y_m[marks], np.zeros(4)])
 
     @property
     def microscope(self) -> np.ndarray | None:
@@ -70,7 +110,46 @@ class KnownPlate:
         return values if np.isfinite(values).all() else None
 
 
-def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
+def reference_now(result: CalibrationResult, where: str, at: str) -> dict[str, Any] | None:
+    """Return the reference length of a calibration at the temperature of its plate now.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        The calibration.
+    where : str
+        Its file, for messages.
+    at : str
+        As for `ReferenceLength.at_temperature`; empty: the temperature is not known, and None is
+        returned.
+
+    Raises
+    ------
+    InputError
+        If the calibration has no certified length of its plate with its temperature, or another
+        coefficient of expansion or temperature of the certificate.
+    """
+    if not at:
+        return None
+    found = result.reference or {}
+    known = found.get("certified")
+    if not known or not ReferenceKind(found["kind"]).of_plate:
+        raise InputError("--reference-at", f"{where} has no reference length of its plate with the "
+                         "temperature of the calibration", "leave it out: the map then has no "
+                         "scale; or calibrate with --reference and --reference-at")
+    certified = ReferenceLength(found["kind"], known["relative_error"], known["u_relative"],
+                                found.get("certificate") or "", marks=found.get("marks"))
+    moved = certified.at_temperature(at)
+    assert moved.certified is not None
+    for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
+        if not np.isclose(moved.certified[name], known[name], rtol=1e-9, atol=0.0):
+            raise InputError("--reference-at", f"{name} is {moved.certified[name]:g}, and "
+                             f"{known[name]:g} in {where}", "change the temperature alone")
+    return {**found, "relative_error": moved.relative_error, "u_relative": moved.u_relative,
+            "certified": moved.certified}
+
+
+def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPlate:
     """Return the plate of a calibration.
 
     Parameters
@@ -79,11 +158,14 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
         The calibration.
     where : str
         Its file, for messages.
+    at : str
+        Temperature of the plate now, as for `reference_now`.
 
     Raises
     ------
     InputError
-        If it is not qualified, or does not have what the plate's covariance needs.
+        If it is not qualified, or does not have what the plate's covariance needs; or as
+        `reference_now`.
     """
     if "recheck" in result.extra:
         raise InputError(where, "is itself a recheck, which does not calibrate a plate",
@@ -96,7 +178,7 @@ def known_plate(result: CalibrationResult, where: str) -> KnownPlate:
         raise InputError(where, "does not contain the covariance of its plate",
                          "calibrate with the method joint and with uncertainty; a plate may have "
                          "31 x 31 marks at most")
-    return KnownPlate(result, kept, where)
+    return KnownPlate(result, kept, where, reference_now(result, where, at))
 
 
 def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
@@ -167,29 +249,32 @@ class NewMap:
     def variances(self, plate: KnownPlate) -> dict[str, np.ndarray]:
         """Return the variances of the map by their sources, (2 n,), m^2.
 
-        Without scale unless the calibration of the plate had a reference length.
+        Without scale unless a reference length sets it.
         """
         nowhere = np.zeros(plate.kept.sites.shape, dtype=bool)
         rows = self.gain.rows
-        if plate.result.reference is None:
+        if plate.reference is None:
             rows = self.without_scale(rows)
         moved = rows @ self.plate
         of_plate = np.einsum("ij,ij->i", moved @ plate.kept.cover(nowhere, self.marks), moved)
         of_noise = np.einsum("ij,j,ij->i", rows, self.white, rows)
         of_noise += ((rows @ self.images)**2).sum(axis=1)
         whole = np.einsum("ij,ij->i", rows @ self.gain.noise, rows)
+        of_length = plate.variance_of_length * (moved @ plate.length_at(self.marks))**2
         return {"reading noise": of_noise, "known plate": np.maximum(of_plate, 0.0),
-                "terms": np.maximum(whole - of_noise, 0.0)}
+                "plate temperature": of_length, "terms": np.maximum(whole - of_noise, 0.0)}
 
     def covariance(self, plate: KnownPlate) -> np.ndarray:
         """Return the covariance of the map at the known nodes, Gx, then Gy, m^2, as `variances`."""
         nowhere, rows = np.zeros(plate.kept.sites.shape, dtype=bool), self.gain.rows
-        if plate.result.reference is None:
+        if plate.reference is None:
             rows = self.without_scale(rows)
         rows = rows[np.tile(self.known.ravel(), 2)]
         moved = rows @ self.plate
+        by_length = moved @ plate.length_at(self.marks)
         return rows @ self.gain.noise @ rows.T + moved @ plate.kept.cover(
-            nowhere, self.marks) @ moved.T
+            nowhere, self.marks) @ moved.T + plate.variance_of_length * np.outer(
+            by_length, by_length)
 
     def without_scale(self, values: np.ndarray) -> np.ndarray:
         """Return maps (2 n, ...) without motion and magnification over the known nodes."""
@@ -253,10 +338,12 @@ def map_change(new: NewMap, plate: KnownPlate) -> Change:
     gain = new.gain.rows[here]
     moved = -np.hstack([both, gain @ new.plate])
     of_old = moved @ plate.kept.cover(sites, new.marks) @ moved.T
+    by_expansion = gain @ new.plate @ plate.length_at(new.marks)
     of_new = gain @ new.gain.noise @ gain.T
+    of_old += plate.variance_of_expansion * np.outer(by_expansion, by_expansion)
     dof = joint_dof((np.trace(of_new), new.dof), (np.trace(of_old), plate.result.noise.dof_xy))
     modes = datum_modes(new.artifact, scale=True).reshape(4, -1).T[here]
-    basis = modes if plate.result.reference is None else modes[:, :3]
+    basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
     cover = of_new + of_old
     z = (new.artifact.x_m + 1j * new.artifact.y_m)[common]

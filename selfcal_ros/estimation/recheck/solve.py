@@ -98,7 +98,7 @@ class Rechecked:
     def error_map(self, plate: KnownPlate) -> ErrorMap:
         """Return the map with its uncertainty, without scale unless a reference length sets it."""
         new, artifact, known = self.new, self.new.artifact, self.new.known
-        xy = new.xy if plate.result.reference else new.without_scale(
+        xy = new.xy if plate.reference else new.without_scale(
             new.xy.reshape(-1)).reshape(new.xy.shape)
         variance = np.sum(list(new.variances(plate).values()), axis=0).reshape(xy.shape)
         (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan)
@@ -172,7 +172,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=before.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
-        reference=plate.result.reference, provenance=provenance_of(measurements, options),
+        reference=plate.reference, provenance=provenance_of(measurements, options),
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
         else None)
     return replace(result, budget=tuple(_budget(result, parts, plate)))
@@ -337,7 +337,7 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
     before = plate.result.noise
     dof = joint_dof((parts["reading noise"].mean(), noise.dof_xy),
                     (parts["known plate"].mean(), before.dof_of("xy")),
-                    (parts["terms"].mean(), np.inf))
+                    (parts["plate temperature"].mean() + parts["terms"].mean(), np.inf))
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
     return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
                    k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
@@ -345,19 +345,24 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
 
 def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
             plate: KnownPlate) -> Iterator[BudgetLine]:
-    """Yield the lines of the budget: noise, known plate, terms; interpolation."""
+    """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
     noise, of_plate = result.noise, plate.result.artifact_map
     u = {"reading noise": noise.sigma_xy, "terms": float("nan"),
-         "known plate": rms(np.stack([of_plate.u_ax, of_plate.u_ay]))}
+         "known plate": rms(np.stack([of_plate.u_ax, of_plate.u_ay])),
+         "plate temperature": float(np.sqrt(plate.variance_of_length))}
     kinds = {"reading noise": ("A", noise.dof_xy, "readings"), "terms": ("B", np.inf, "default"),
-             "known plate": ("A", plate.result.noise.dof_of("xy"), "declared")}
+             "known plate": ("A", plate.result.noise.dof_of("xy"), "declared"),
+             "plate temperature": ("B", np.inf, "declared")}
     by = next((way for way in ("declared", "repeats")
                if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy), "residuals")
     for name, variance in parts.items():
+        if name == "plate temperature" and plate.reference is None:
+            continue
         (kind, dof, source), each = kinds[name], np.sqrt(variance)
         details: dict[str, object] = {"plate": plate.where} if name != "reading noise" else {
             "by": by, "contradicted": False}
-        yield BudgetLine("xy", name, kind, 0.0, u[name], "m", rms(each), float(each.max()), dof,
+        unit = "m/m" if name == "plate temperature" else "m"
+        yield BudgetLine("xy", name, kind, 0.0, u[name], unit, rms(each), float(each.max()), dof,
                          source, details)
     yield from (line for line in budget_lines(result)
                 if (line.quantity, line.component) == ("xy", INTERPOLATION))

@@ -17,6 +17,8 @@ _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
            "declared": "declared by the detections"}
 
 OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
+              "plate temperature": "temperature of the plate now, and its expansion coefficient, "
+                                   "beyond what its calibration in {} contains",
               "terms": "sizes of the terms of the model, which these views do not determine"}
 """How a line of the budget was found, given the file of the plate."""
 
