@@ -25,6 +25,7 @@ from yaml.resolver import Resolver
 
 from selfcal_ros.errors import InputError, first_line, known_are
 from selfcal_ros.outputs import write_text
+from selfcal_ros.portable import AT_ONCE
 
 MAX_YAML_BYTES = 4 << 20
 MAX_YAML_NODES = 50_000
@@ -189,7 +190,7 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if stat.S_ISREG(os.stat(path).st_mode):  # opening a device may have side effects
         with open(path, "rb", opener=lambda name, flags: os.open(
-                name, flags | os.O_NONBLOCK)) as file:
+                name, flags | AT_ONCE)) as file:
             found = os.fstat(file.fileno())
             if stat.S_ISREG(found.st_mode) and found.st_size <= limit:
                 return file.read(found.st_size)

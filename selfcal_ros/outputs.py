@@ -2,7 +2,6 @@
 """Atomic file output."""
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -14,10 +13,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from selfcal_ros import portable
 from selfcal_ros.errors import InputError, first_line
 
 TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
@@ -59,6 +60,9 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(fd)
             temporary.chmod(_mode(target))
+            if portable.LOCKS:  # else it cannot be renamed while it is open
+                temporary.replace(target)
+        if not portable.LOCKS:
             temporary.replace(target)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -68,6 +72,10 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
 @contextlib.contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a hidden folder in `parent` that is removed when the block ends."""
+    if not portable.LOCKS:  # then a folder cannot be opened, either
+        with TemporaryDirectory(dir=parent, prefix=".selfcal.", ignore_cleanup_errors=True) as made:
+            yield Path(made)
+        return
     temporary, fd = _temporary(parent, folder=True)
     try:
         yield temporary
@@ -79,13 +87,14 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
     """Create a temporary file or folder; return it and the descriptor of its lock."""
     sweep(parent)
+    new = os.O_RDWR | os.O_CREAT | os.O_EXCL | portable.AT_ONCE
     while True:
         path = parent / f".selfcal.{secrets.token_hex(8)}"
         if folder:
             path.mkdir(0o700)
-        fd = os.open(path, os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        fd = os.open(path, os.O_RDONLY if folder else new, 0o600)
         with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(fd, fcntl.LOCK_EX)
+            portable.lock(fd, wait=True)
         if path.exists():  # it was not removed before it was locked
             return path, fd
         os.close(fd)
@@ -94,6 +103,8 @@ def _temporary(parent: Path, *, folder: bool = False) -> tuple[Path, int]:
 @cache
 def sweep(folder: Path) -> None:
     """Remove unfinished files of killed processes in a folder; once per process."""
+    if not portable.LOCKS:  # nothing tells whether a writer still runs
+        return
     with contextlib.suppress(OSError):
         for path in list(folder.iterdir()):
             if TEMPORARY.fullmatch(path.name) and (path.is_file() or path.is_dir()):
@@ -103,9 +114,9 @@ def sweep(folder: Path) -> None:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove a temporary file or folder; OSError if its writer still holds the lock."""
-    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    fd = os.open(path, os.O_RDONLY | portable.NO_LINK)
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        portable.lock(fd)
         if path.is_dir():
             shutil.rmtree(path)
         else:

@@ -7,9 +7,10 @@ the system until `cli.main.main` or `nodes.running.run` unblock it.
 
 import importlib.util
 import os
-import signal
 import sys
 from functools import partial
+
+from selfcal_ros.portable import hold_interrupts
 
 BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
 """Command that builds the messages as well: colcon does not search inside a package."""
@@ -33,7 +34,7 @@ def missing_ros() -> str:
 
 def begin_node() -> None:
     """Block interrupts while a node is imported; end the process if the import fails."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    hold_interrupts(held=True)
     missing = missing_ros()
     if missing:
         print(f"selfcal: environment: {missing}", file=sys.stderr)
@@ -56,7 +57,7 @@ def open_streams() -> None:
 def selfcal() -> int:
     """Run the command ``selfcal``."""
     open_streams()
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    hold_interrupts(held=True)
     return importlib.import_module("selfcal_ros.cli.main").main()
 
 

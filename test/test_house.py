@@ -9,8 +9,9 @@ import pytest
 
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-BASE = {"blocks": {"errors"}, "errors": set(), "topics": set(), "units": set(), "start": set(),
-        "outputs": {"errors"}, "files": {"errors", "outputs"},
+BASE = {"blocks": {"errors"}, "errors": set(), "topics": set(), "units": set(),
+        "portable": set(), "start": {"portable"}, "outputs": {"errors", "portable"},
+        "files": {"errors", "outputs", "portable"},
         "results": {"files", "model"}}
 """Modules that any package may import (`start`: the edges), and what they import."""
 ROW = re.compile(r"\| `(\w+)` \|[^|]*\|([^|]*)\|")

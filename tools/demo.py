@@ -41,12 +41,12 @@ def demo() -> int:
     output = (FOLDER / "result.json").relative_to(Path.cwd(), walk_up=True)
     print(f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
           "pose_sequencer and solver ...", flush=True)
-    code = selfcal(["replay", str(BAG), "--fast", "-o", str(output)])
+    code = selfcal(["replay", str(BAG), "--fast", "--force", "-o", str(output)])
     if code:
         return code
     result = result_from_dict(read_json(output), str(output))
     save_picture(map_picture(result, read_truth(BAG)), FOLDER / "map.png")
-    code = selfcal(["report", str(output), "-o", str(FOLDER / "report.html"),
+    code = selfcal(["report", str(output), "--force", "-o", str(FOLDER / "report.html"),
                     "--truth", str(BAG / "truth.json")])
     if code:
         return code

@@ -5,7 +5,6 @@ A journal is a growing bag folder. If the writer is killed, it contains every me
 flushed; `resume` completes the file and continues in a new one of the same bag.
 """
 
-import fcntl
 import os
 import re
 import threading
@@ -18,6 +17,7 @@ from pathlib import Path
 import yaml
 from mcap.records import Channel, Schema
 
+from selfcal_ros import portable
 from selfcal_ros.bagio.journal_file import (
     Content,
     JournalFile,
@@ -374,7 +374,7 @@ def _locked(path: Path) -> int:
     """Return a lock on a folder; the system releases it when the process ends."""
     lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        portable.lock(lock)
     except BlockingIOError as error:
         os.close(lock)
         raise InputError(str(path), "another process writes this journal",

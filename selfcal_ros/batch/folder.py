@@ -5,7 +5,6 @@ Independent of the estimator: the command that distributes the jobs starts witho
 """
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -14,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from selfcal_ros import __version__
+from selfcal_ros import __version__, portable
 from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_json
@@ -166,7 +165,7 @@ def opened(folder: Path) -> Iterator[None]:
                          "name a writable folder") from error
     with lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            portable.lock(lock.fileno())
         except OSError as error:
             raise InputError(str(folder), "another batch works in this folder",
                              "wait for it to end or name another folder") from error

@@ -23,7 +23,7 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("maps", metavar="RESULT.json", nargs="+",
+    parser.add_argument("maps", metavar="RESULT.json|MAP.csv", nargs="+",
                         help="results of `selfcal solve`, and maps from other sources as CSV (x, "
                         "y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes)")
     parser.add_argument("-o", "--output", metavar="MEAN.json", required=True,

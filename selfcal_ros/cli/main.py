@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NoReturn
 
 from selfcal_ros import __version__
+from selfcal_ros.cli.arguments import add_force, check_existing, misplaced
 from selfcal_ros.cli.verbs import (
     EXAMPLES,
     GROUPS,
@@ -28,6 +29,7 @@ from selfcal_ros.cli.verbs import (
     verbs_of_others,
 )
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, did_you_mean, printable
+from selfcal_ros.portable import hold_interrupts
 
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
@@ -51,6 +53,7 @@ def build_parser(only: str | None = None) -> "Parser":
             _configure(sub, importlib.import_module(module_of(name)))
             for words, leaf in _leaves(sub, name):
                 leaf.example = EXAMPLES.get(words, "")
+                add_force(leaf)
     if only not in VERBS:
         for name, point in verbs_of_others().items():
             sub = group.add_parser(name, help=summary_of(point), description=summary_of(point))
@@ -92,7 +95,7 @@ def _complete() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start`
+        hold_interrupts(held=False)  # by `start`
         if COMPLETE in os.environ:
             _complete()
         code = _run(sys.argv[1:] if argv is None else argv)
@@ -105,7 +108,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     """Run one verb; an error is one line on stderr."""
-    prefix = "selfcal"
+    prefix, args = "selfcal", None
     try:
         if words[:1] == ["help"]:
             words = [*words[1:], "--help"]
@@ -116,9 +119,11 @@ def _run(words: list[str]) -> int:
         args = parser.parse_args(words)
         args.words = words
         prefix = f"selfcal {args.verb}"
+        check_existing(args)
         return int(args.run(args))
     except SelfcalError as error:
-        return _refused(f"{prefix}: {error}", error.exit_code)
+        fault = (misplaced(args) if args is not None else None) or error
+        return _refused(f"{prefix}: {fault}", fault.exit_code)
     except KeyboardInterrupt:
         return _refused(f"{prefix}: interrupted", 128 + signal.SIGINT)
     except ModuleNotFoundError as error:
@@ -129,7 +134,7 @@ def _run(words: list[str]) -> int:
     except OSError as error:  # a name too long, a disk that fails
         if error.errno is None:
             raise
-        fault = InputError(error.filename or "system", str(error.strerror),
+        fault = InputError(str(error.filename or "system"), str(error.strerror),
                            "check path, disk and permissions")
         return _refused(f"{prefix}: {fault}", fault.exit_code)
 
@@ -211,6 +216,9 @@ class Parser(argparse.ArgumentParser):
         """Refuse a value that is not among the choices, with similar ones."""
         if action.choices is None or value in action.choices:
             return
+        if not action.option_strings and os.path.exists(str(value)):
+            raise argparse.ArgumentError(None, f"'{value}' is a file, and {_name_of(action)} comes "
+                                         "first")
         choices: Iterable[str] = map(str, action.choices)
         known = list(choices)
         hint = did_you_mean(str(value), known) or f"known are {', '.join(known)}"

@@ -223,7 +223,7 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     views = [view for view in plan.views if view.grid]
     orders = {view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER)
               for view in views}
-    cut = [view for view in views if view.repeats % orders[view.name].passes]
+    cut = [view for view in views if view.repeats < orders[view.name].passes]
     lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
              f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
              "one reading;",
@@ -233,6 +233,6 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     if cut:
         names = ", ".join(f"'{view.name}'" for view in cut)
         first = orders[cut[0].name]
-        lines.append(f"  the order {first} needs a multiple of {first.passes} repeats: it is "
-                     f"truncated in the views {names}")
+        lines.append(f"  the order {first} needs {first.passes} repeats: it is truncated "
+                     f"in the views {names}")
     return lines

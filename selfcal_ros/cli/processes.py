@@ -7,7 +7,6 @@ Nodes are supervised, the monitor process is read and asked.
 import argparse
 import contextlib
 import ctypes
-import fcntl
 import json
 import os
 import queue
@@ -22,6 +21,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
+from selfcal_ros import portable
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 from selfcal_ros.start import missing_ros
@@ -143,7 +143,7 @@ def domain(chosen: int | None = None) -> Iterator[dict]:
     for number in range(50, 100):
         with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                portable.lock(lock.fileno())
             except OSError:
                 continue
             if _is_used(number):

@@ -3,6 +3,7 @@
 
 import argparse
 import json
+from pathlib import Path
 
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, tell
@@ -27,11 +28,25 @@ def run(args: argparse.Namespace) -> int:
     return solve.run(args)
 
 
+def _awaited(args: argparse.Namespace, plan: "Plan") -> int:
+    """Print what can be said before the plate is calibrated."""
+    if args.json:
+        print(json.dumps({"plan_id": plan.plan_id, "identifiable": None,
+                          "artifact_from": plan.artifact_from, "predicted": None}, indent=1))
+        return int(ExitCode.DONE)
+    tell(f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of a plate that a calibration "
+         f"makes known\n{plan.artifact_from} is not there yet: `selfcal solve BAG -o FILE` writes "
+         "it;\nwhat the view will show is predicted from it")
+    return int(ExitCode.DONE)
+
+
 def planned(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what views of a known plate will show; for `selfcal plan check`."""
     if args.plan_verb == "suggest":
         raise InputError(args.plan, "its plate is already calibrated: any view that reads all "
                          "marks will do", "use selfcal plan check")
+    if not Path(plan.artifact_from).exists():
+        return _awaited(args, plan)
     plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
         found = predict_recheck(plan, plate)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.aerotech.verify import table_chapter
+from selfcal_ros.cli.arguments import refuse_existing
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
     check_outputs([args.result, args.truth, args.table, args.details], [output, args.plot])
     check_name(output)
+    refuse_existing(output, force=args.force)
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     details = read_details(args.details) if args.details else None

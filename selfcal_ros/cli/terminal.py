@@ -107,6 +107,8 @@ def show(result: CalibrationResult, bag: str, output: str | None, stream: TextIO
           file=stream)
     if output:
         print(f"result: {output}", file=stream)
+    elif stream is sys.stdout:
+        print("result: not kept; -o RESULT.json writes it", file=stream)
 
 
 def exit_code(result: CalibrationResult) -> int:

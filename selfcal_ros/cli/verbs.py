@@ -94,7 +94,7 @@ EXAMPLES = {
     "cal straightness": "selfcal cal straightness RESULT.json -o straightness.cal",
     "cal orthogonality": "selfcal cal orthogonality --measured 5um --over 200mm --travel 300mm "
                          "-o square.cal",
-    "gcode": "selfcal gcode part.nc RESULT.json -o corrected.nc",
+    "gcode": "selfcal gcode part.nc RESULT.json -o corrected.nc --dialect linuxcnc",
     "certificate": "selfcal certificate RESULT.json config/certificates/details.yaml -o dcc.xml",
     "iso230": "selfcal iso230 RESULT.json",
     "plan check": "selfcal plan check config/plans/hu.yaml --sigma 20nm",

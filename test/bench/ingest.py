@@ -154,7 +154,8 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
     if method == SOLVE:
         who, out = resource.RUSAGE_CHILDREN, bag.with_name(f"{bag.name}_result.json")
         taken, _ = timed(lambda: subprocess.run(
-            [sys.executable, "-m", "selfcal_ros", "solve", str(bag), "--quiet", "-o", str(out)],
+            [sys.executable, "-m", "selfcal_ros", "solve", str(bag), "--quiet", "--force",
+             "-o", str(out)],
             check=True))
         error = error_of(json.loads(out.read_text())["error_map"], bag)
     elif method in (READ, SOLVE_ONLY):

@@ -101,7 +101,7 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
         assert (f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
                 in line)
     assert outside.startswith("selfcal apply: points outside the field, left empty (")
-    assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--inverse"]) == 2
+    assert main(["apply", "R.json", "d.csv", "-o", "x.csv", "--inverse"]) == 2
     assert "the ends of distances are true positions" in capsys.readouterr().err
 
 
@@ -131,7 +131,7 @@ def test_beyond_the_edge_nothing_is_known(desk, capsys, inverse):
     known = np.isfinite(rows[:, 3:])
     np.testing.assert_array_equal(known, [[True] * 6, *[[False, False, True] * 2] * 2])
     assert "left empty (--outside edge" in capsys.readouterr().err
-    assert main([*words, "--outside", "edge"]) == 0
+    assert main([*words, "--outside", "edge", "--force"]) == 0
     edge = table(desk / "o.csv")[1]
     np.testing.assert_array_equal(np.isfinite(edge[:, 3:6]), True)
     np.testing.assert_array_equal(np.isfinite(edge[:, 6:]), known[:, 3:])
@@ -152,7 +152,7 @@ def test_points_in_mm_are_asked_about(desk, capsys, text, words, code):
 
 
 def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys):
-    words = ["apply", "R.json", "p.csv", "-o", "o.csv"]
+    words = ["apply", "R.json", "p.csv", "-o", "o.csv", "--force"]
     (desk / "p.csv").write_bytes(b"\xef\xbb\xbfx,y\r\n0.01,-0.005\r\n0,0\r\n,\r\n")
     assert main(words) == 0
     np.testing.assert_array_equal(table(desk / "o.csv")[1][:, :2], [[0.01, -0.005], [0, 0]])
@@ -186,5 +186,5 @@ def test_bicubic_is_advised_where_it_halves_u_between_the_nodes(desk, capsys):
         u = np.full(wave.shape, 1e-9)
         write_json("R.json", result_to_dict(result_of(replace(
             emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u))))
-        assert main(["apply", "R.json", "d.csv", "-o", "o.csv"]) == 0
+        assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--force"]) == 0
         assert ("with --method bicubic" in capsys.readouterr().err) is advised

@@ -38,7 +38,7 @@ def files(folder, monkeypatch):
 
 
 def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
-    assert main(["combine", *files, "-o", "mean.json"]) == 0
+    assert main(["combine", *files, "-o", "mean.json", "--force"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("mean of 3 maps: Good: the runs agree within their uncertainties")
     assert "3.json: weight 0.3" in text and "disagrees" not in text
@@ -60,8 +60,8 @@ def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
 
 def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):
     table = str(tmp_path / "other.csv")
-    assert main(["table", "2.json", "-o", table]) == 0
-    assert main(["combine", "1.json", table, "-o", "mean.json", "--json"]) == 0
+    assert main(["table", "2.json", "-o", table, "--force"]) == 0
+    assert main(["combine", "1.json", table, "-o", "mean.json", "--force", "--json"]) == 0
     said = json.loads(capsys.readouterr().out.partition("\n")[2])
     assert [run["file"] for run in said["runs"]] == ["1.json", table]
     one, other, mean = (read_json(name)["error_map"] for name in ("1.json", "2.json", "mean.json"))
@@ -73,7 +73,7 @@ def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):
     plain = tmp_path / "plain.csv"
     plain.write_text("x,y,gx,gy,u_gx,u_gy\n0,0,1e-7,2e-7,1e-8,1e-8\n0.01,0,0,0,1e-8,1e-8\n"
                      "0,0.01,0,0,1e-8,1e-8\n-0.01,0.02,0,0,1e-8,\n")
-    assert main(["combine", "1.json", str(plain), "-o", "mean.json"]) == 0
+    assert main(["combine", "1.json", str(plain), "-o", "mean.json", "--force"]) == 0
     assert np.isfinite(np.array(read_json("mean.json")["error_map"]["gx"], float)).sum() == 3
     assert "unknown in the mean: 22" in capsys.readouterr().out
 
@@ -81,14 +81,14 @@ def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):
 def test_a_table_of_one_of_the_runs_is_the_same_recording(files, tmp_path, capsys):
     """Its map is equal, to a few digits too."""
     own = str(tmp_path / "own.csv")
-    assert main(["table", "1.json", "-o", own]) == 0
-    assert main(["combine", "1.json", own, "-o", "mean.json"]) == 2
+    assert main(["table", "1.json", "-o", own, "--force"]) == 0
+    assert main(["combine", "1.json", own, "-o", "mean.json", "--force"]) == 2
     assert "own.csv: of the same readings as 1.json" in capsys.readouterr().err
     head, *rows = (tmp_path / "own.csv").read_text().splitlines()
     short = tmp_path / "short.csv"
     short.write_text("\n".join([head, *(",".join(
         cell and f"{float(cell):.5g}" for cell in row.split(",")) for row in rows)]))
-    assert main(["combine", "1.json", str(short), "-o", "mean.json"]) == 2
+    assert main(["combine", "1.json", str(short), "-o", "mean.json", "--force"]) == 2
     assert "short.csv: of the same readings as 1.json" in capsys.readouterr().err
 
 
@@ -106,11 +106,11 @@ def negated(text, columns):
     (("gx",), False), ((), False)])  # an axis alone is wired otherwise: it disagrees
 def test_a_map_of_the_opposite_sign_is_refused_as_such(files, tmp_path, capsys, columns, refused):
     table, other = tmp_path / "own.csv", tmp_path / "other.csv"
-    assert main(["table", "2.json", "-o", str(table)]) == 0
+    assert main(["table", "2.json", "-o", str(table), "--force"]) == 0
     other.write_text(negated(table.read_text(), columns))
     capsys.readouterr()
     for order in (["1.json", "3.json", str(other)], [str(other), "1.json"]):
-        assert main(["combine", *order, "-o", "mean.json"]) == (2 if refused else 0)
+        assert main(["combine", *order, "-o", "mean.json", "--force"]) == (2 if refused else 0)
         error = capsys.readouterr().err
         assert (error == f"selfcal combine: {other}: of the opposite sign to 1.json: its negative "
                 "agrees, and it does not; give G = indicated - true\n") is refused
@@ -125,7 +125,8 @@ def test_maps_within_their_u_have_no_sign(files, tmp_path):
         rows = [f"{(i - 2) * 0.01},{(j - 2) * 0.01},{-given['gx'][i][j]},{-given['gy'][i][j]},"
                 f"{u['gx']},{u['gy']}" for i in range(5) for j in range(5)]
         (tmp_path / "n.csv").write_text("x,y,gx,gy,u_gx,u_gy\n" + "\n".join(rows))
-        assert main(["combine", "1.json", str(tmp_path / "n.csv"), "-o", "mean.json"]) == code
+        assert main(["combine", "1.json", str(tmp_path / "n.csv"), "-o", "mean.json",
+                     "--force"]) == code
 
 
 HEAD = "x,y,gx,gy,u_gx,u_gy\n"
@@ -147,13 +148,13 @@ HEAD = "x,y,gx,gy,u_gx,u_gy\n"
 def test_a_table_that_is_no_map_is_one_line(files, tmp_path, monkeypatch, capsys, text, message):
     name = tmp_path / "x.csv"
     name.write_text(text)
-    assert main(["combine", "1.json", str(name), "-o", "mean.json"]) == 2
+    assert main(["combine", "1.json", str(name), "-o", "mean.json", "--force"]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
 
 
 def test_maps_alone_give_no_lattice(files, capsys):
-    assert main(["combine", "a.csv", "b.csv", "-o", "mean.json"]) == 2
+    assert main(["combine", "a.csv", "b.csv", "-o", "mean.json", "--force"]) == 2
     assert "no RESULT.json is named" in capsys.readouterr().err
     assert main(["combine", "1.json", "-o", "1.json"]) == 2
     assert "would be overwritten" in capsys.readouterr().err

@@ -211,7 +211,8 @@ def test_the_table_of_a_result(tmp_path, capsys):
     assert float(line["g_theta_rad"]) == emap.g_theta[1]
     assert float(line["angle_rad"]) == pytest.approx(2 * np.pi / result.artifact.angular_count)
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.npz")]) == 0
-    arrays = np.load(tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as file:
+        arrays = dict(file)
     np.testing.assert_array_equal(arrays["gx"], emap.gx)
     np.testing.assert_array_equal(arrays["ay"], result.artifact_map.ay)
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.txt")]) == 2
@@ -226,7 +227,7 @@ def test_the_table_of_a_result(tmp_path, capsys):
     doubted = replace(result, verdict=Verdict(
         Grade.NOT_QUALIFIED, sentence="Not qualified: the plate slipped"))
     write_json(tmp_path / "r.json", result_to_dict(doubted))
-    assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv")]) == 5
+    assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv"), "--force"]) == 5
     assert capsys.readouterr().err == "selfcal: Not qualified: the plate slipped\n"
 
 
@@ -326,7 +327,7 @@ def test_the_picture_of_a_result_is_what_its_ending_says_and_repeatable(tmp_path
     data = []
     for name in ("a", "b"):
         path = tmp_path / f"{name}.{kind}"
-        assert main(["plot", str(tmp_path / "r.json"), "-o", str(path), "--json"]) == 0
+        assert main(["plot", str(tmp_path / "r.json"), "-o", str(path), "--json", "--force"]) == 0
         assert json.loads(capsys.readouterr().out) == {"written": str(path), "kind": kind}
         data.append(path.read_bytes())
     if not hasattr(RendererSVG, "_get_clippath_id"):  # matplotlib 3.8 names them by their address

@@ -72,7 +72,8 @@ def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys
     assert detect(bag, tmp_path / "found", "--json") == 0
     counts = json.loads(capsys.readouterr().out)["counts"]
     assert counts == {"images": 140, "images_refused": 0, "images_without_marks": 0, "marks": 140}
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"),
+                     "--force"]) in (0, 5)
     result, truth = read_json(tmp_path / "R.json"), read_json(bag / "truth.json")
     emap = result["error_map"]
     for axis in ("gx", "gy"):
@@ -241,7 +242,8 @@ def test_a_folder_of_files_gives_the_detections_of_the_bag(bag, tmp_path):
     latched = [one["topic_metadata"]["name"] for one in topics if "transient_local" in str(
         one["topic_metadata"]["offered_qos_profiles"])]
     assert latched == [f"/{COMMAND_TOPIC}"]
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"),
+                     "--force"]) in (0, 5)
     result, truth = read_json(tmp_path / "R.json"), read_json(folder / "truth.json")
     for axis in ("gx", "gy"):
         away = np.array(result["error_map"][axis], float) - truth[axis]
@@ -258,7 +260,8 @@ def test_the_times_of_files_are_those_of_the_table_and_unknown_without(tmp_path)
     for name, table in (("timed", tmp_path / "timed.csv"), ("plain", folder / "positions.csv")):
         assert detect(folder, tmp_path / name, "--positions", str(table),
                       "--plan", str(tmp_path / "plan.yaml")) == 0
-        assert main(["solve", str(tmp_path / name), "-o", str(tmp_path / "R.json")]) in (0, 5)
+        assert main(["solve", str(tmp_path / name), "-o", str(tmp_path / "R.json"),
+                     "--force"]) in (0, 5)
         found[name] = read_json(tmp_path / "R.json")
     made = found["timed"]["provenance"]
     assert made["first_exposure"] == "2026-11-21T09:10:00.500+00:00"
@@ -365,7 +368,8 @@ def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
     assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
     assert main(["detect", str(tmp_path / "bag"), "-o", str(tmp_path / "found"), "--pixel-size",
                  "4e-6", "--mark-size", "60e-6", "--turn", "90"]) == 0
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (0, 5)
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"),
+                     "--force"]) in (0, 5)
     result, truth = read_json(tmp_path / "R.json"), read_json(tmp_path / "bag" / "truth.json")
     assert result["observability"]["identifiable"] and result["rejected"] == {}
     for axis in ("gx", "gy"):

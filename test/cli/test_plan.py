@@ -196,12 +196,23 @@ def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp
 
 
 def test_an_order_that_is_cut_off_is_said(capsys):
-    assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back"]) == 0
-    assert ("  the order x_back_y_back needs a multiple of 4 repeats: it is truncated in the views "
-            "'identity', 'rot90', 'shift_x'\n") in capsys.readouterr().out
-    assert main(["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back",
-                 "--repeats", "8"]) == 0
+    asked = ["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back", "--repeats"]
+    assert main([*asked, "3"]) == 0
+    assert ("  the order x_back_y_back needs 4 repeats: it is truncated in the views 'identity', "
+            "'rot90', 'shift_x'\n") in capsys.readouterr().out
+    assert main([*asked, "4"]) == 0
     assert "truncated" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["hu_repeated", "six_views", "resistant", "recheck"])
+def test_a_shipped_plan_has_nothing_against_itself(capsys, name):
+    """The result that recheck.yaml names is not shipped."""
+    assert main(["plan", "check", shipped(name)]) == 0
+    said = capsys.readouterr()
+    assert not said.err and "truncated" not in said.out
+    assert main(["plan", "check", shipped(name), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["identifiable"] is (None if name == "recheck" else True)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -266,7 +277,7 @@ def test_suggest_against_terms(capsys, tmp_path):
     data = yaml.safe_load(Path(shipped("qiao")).read_text())
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(data | {"model_terms": ["plate_shape:30e-9"]}))
-    assert main(["plan", "suggest", str(path), "-o", str(out)]) == 0
+    assert main(["plan", "suggest", str(path), "-o", str(out), "--force"]) == 0
     assert "  u XY rms " in capsys.readouterr().out
     assert plan_from_dict(read_yaml(out), "next").model_terms == ("plate_shape:3e-08",)
 

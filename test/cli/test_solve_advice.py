@@ -42,7 +42,7 @@ def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, 
     outputs = []
     for bag, lines in ((plain, 0), (spoilt, 4)):
         output = tmp_path / "result.json"
-        assert main(["solve", str(bag), "--quiet", "-o", str(output)]) == 0
+        assert main(["solve", str(bag), "--quiet", "--force", "-o", str(output)]) == 0
         said = capsys.readouterr().err.splitlines()
         assert len(said) == lines
         assert all(": a view command was not used: view " in line for line in said)

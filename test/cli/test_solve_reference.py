@@ -14,7 +14,7 @@ BAG = str(Path(__file__).parents[2] / "bags" / "hu_exact")
 
 def solved(tmp_path, *options, code=0):
     out = tmp_path / "r.json"
-    assert main(["solve", BAG, "--quiet", "-o", str(out), *options]) == code
+    assert main(["solve", BAG, "--quiet", "--force", "-o", str(out), *options]) == code
     result = json.loads(out.read_text())
     maps = result["error_map"] | result["artifact_map"]
     return {key: np.array(maps[key]) for key in ("gx", "gy", "u_gx", "ax", "ay")}

@@ -469,10 +469,11 @@ def test_the_verb_writes_refuses_and_ends_with_the_code_of_the_result(tmp_path, 
     printed = ET.fromstring(capsys.readouterr().out)
     np.testing.assert_allclose(values(named(printed, "Gx")[0]), RESULT.error_map.gx.ravel(),
                                rtol=1e-8)
-    assert main(["certificate", bad, str(DETAILS), "-o", out]) == 2
+    assert main(["certificate", bad, str(DETAILS), "-o", out, "--force"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "--not-qualified" in error
-    assert main(["certificate", bad, str(DETAILS), "-o", out, "--not-qualified"]) == 5
+    assert main(["certificate", bad, str(DETAILS), "-o", out, "--not-qualified",
+                 "--force"]) == 5
     assert main(["certificate", good, str(DETAILS), "-o", good]) == 2
 
 
@@ -488,11 +489,11 @@ def test_the_report_has_the_same_for_people(tmp_path, capsys):
     for part in ("EX-2026-0042", "Example Calibration Laboratory", "Example Machine Builder",
                  "Example Stages XY-theta stage XYT-200", "4711", "A. Example"):
         assert part in first_page, part
-    assert main(["report", result, "-o", str(page)]) == 0
+    assert main(["report", result, "-o", str(page), "--force"]) == 0
     assert "EX-2026-0042" not in page.read_text()
     bad = tmp_path / "d.yaml"
     bad.write_text("item: {}")
-    assert main(["report", result, "--details", str(bad), "-o", str(page)]) == 2
+    assert main(["report", result, "--details", str(bad), "-o", str(tmp_path / "d.html")]) == 2
     assert "certificate: is missing" in capsys.readouterr().err
     apart = solved()
     chapter = certificate_chapter(replace(apart, views=()), details())

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files among the arguments of all verbs: outputs that exist, inputs of another kind.
+
+What an argument stands for is its name in the help: BAG, RESULT.json, PLAN.yaml, ...
+"""
+
+import argparse
+import os
+import re
+import shlex
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from selfcal_ros.errors import InputError
+
+OUTPUTS = {"--output", "--report", "--plot", "--theta-output", "--cal", "--save-csv"}
+"""Options that name a file to write."""
+FOLDERS = ("BAG", "FOLDER", "DIR")
+"""Names of outputs that are folders: they are never replaced."""
+SEEN = 1 << 14
+"""Bytes at the beginning of a file by which its kind is recognised."""
+
+BAG, RESULT, PLAN, SIMULATION = "a bag", "a result", "a plan", "a simulation"
+PARAMETERS, CAL, TABLE, PROGRAM = ("a parameter file of nodes", "a calibration file",
+                                   "a table of numbers", "a G-code program")
+WANTED = {"BAG": BAG, "A.json": RESULT, "B.json": RESULT, "RESULT.json": RESULT,
+          "PLAN.yaml": PLAN, "SIM.yaml": SIMULATION, "NODES.yaml": PARAMETERS, "FILE.cal": CAL,
+          "ACTIVE.cal": CAL, "POINTS.csv": TABLE, "MAP.csv": TABLE, "DATA.csv": TABLE,
+          "IN": PROGRAM}
+"""Name of an argument -> kind of file that it stands for."""
+USES = {BAG: "a map is computed from it with `selfcal solve {} -o RESULT.json`",
+        RESULT: "`selfcal report {}` shows it",
+        PLAN: "`selfcal plan check {}` says what it determines",
+        SIMULATION: "`selfcal simulate {} -o BAG` writes its bag",
+        PARAMETERS: "give it with --params",
+        CAL: "`selfcal cal check {}` reads it",
+        TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points",
+        PROGRAM: "`selfcal gcode {} RESULT.json -o OUT` corrects it"}
+"""Kind of file -> what it is good for, with its name."""
+BEGINNINGS = (
+    (BAG, re.compile(rb"\x89MCAP0\r\n")),
+    (RESULT, re.compile(rb'\s*\{\s*"schema": "selfcal\.result/')),
+    (CAL, re.compile(rb"(?:.*\n)*?:(?:START|GALVO2D)")),
+    (PARAMETERS, re.compile(rb"(?:.*\n)*?\s+ros__parameters\s*:")),
+    (PLAN, re.compile(rb"(?:.*\n)*?plan_id\s*:")),
+    (SIMULATION, re.compile(rb"(?:.*\n)*?(?:plan|truth|noise)\s*:")))
+ENDINGS = {".csv": TABLE, ".nc": PROGRAM, ".ngc": PROGRAM, ".gcode": PROGRAM}
+
+
+class File(NamedTuple):
+    """An input among the arguments: its name, the kinds it may be of, and the one it is of."""
+
+    path: str
+    wanted: tuple[str, ...]
+    kind: str
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether it is known to be of another kind."""
+        return bool(self.kind) and self.kind not in self.wanted
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--force`` to a verb that writes files and has none yet."""
+    if "--force" not in parser._option_string_actions and any(_outputs(parser)):
+        parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def _outputs(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield the arguments that name files to write."""
+    for action in parser._actions:
+        if OUTPUTS.intersection(action.option_strings) and action.metavar not in FOLDERS:
+            yield action
+
+
+def check_existing(args: argparse.Namespace) -> None:
+    """Refuse to replace a file without ``--force``.
+
+    An input, or a file in a bag, that is named as an output is left to the verb, which never writes
+    it; an empty file has nothing to lose.
+
+    Raises
+    ------
+    InputError
+        If the file of an output exists.
+    """
+    inputs = {os.path.realpath(item.path) for item in _files(args)}
+    for action in _outputs(args.leaf):
+        name = getattr(args, action.dest)
+        place = os.path.realpath(name or "")
+        if name and place not in inputs and os.path.dirname(place) not in inputs:
+            refuse_existing(name, force=args.force)
+
+
+def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:
+    """Raise InputError if `path` is a file with content, and ``--force`` is not given."""
+    if not force and os.path.isfile(path) and os.path.getsize(path):
+        raise InputError(str(path), "the file exists",
+                         "name another file, or replace it with --force")
+
+
+def misplaced(args: argparse.Namespace) -> InputError | None:
+    """Return the error of inputs that are of another kind than their places ask for; or None."""
+    files = list(_files(args))
+    wrong = [item for item in files if item.misplaced]
+    for first in wrong:
+        for other in wrong:
+            if first.kind in other.wanted and other.kind in first.wanted:
+                words = [{first.path: other.path, other.path: first.path}.get(word, word)
+                         for word in args.words]
+                return InputError(first.path, f"is {first.kind}, and {other.path} is {other.kind}: "
+                                  "they are swapped", f"write `selfcal {shlex.join(words)}`")
+    for item in wrong:
+        return InputError(item.path, f"is {item.kind}, and {' or '.join(item.wanted)} is needed "
+                          "here", USES[item.kind].format(shlex.quote(item.path)))
+    return None
+
+
+def _files(args: argparse.Namespace) -> Iterator[File]:
+    """Yield the inputs among the arguments that are files or folders."""
+    for action in args.leaf._actions:
+        wanted = tuple(WANTED[name] for name in str(action.metavar).split("|") if name in WANTED)
+        values = getattr(args, action.dest, None)
+        for value in values if isinstance(values, list) else [values]:
+            if wanted and isinstance(value, str) and not OUTPUTS.intersection(
+                    action.option_strings):
+                yield File(value, wanted, kind_of(value))
+
+
+def kind_of(path: str) -> str:
+    """Return the kind of a file or folder; "" if it is not one that verbs read."""
+    try:
+        if os.path.isdir(path):
+            names = os.listdir(path)
+            return BAG if any(name == "metadata.yaml" or name.endswith(".mcap")
+                              for name in names) else ""
+        if not os.path.isfile(path):
+            return ""
+        with open(path, "rb") as file:
+            beginning = file.read(SEEN)
+    except (OSError, ValueError):
+        return ""  # whoever reads it says why not
+    ending = ENDINGS.get(os.path.splitext(path)[1].lower(), "")
+    return next((kind for kind, pattern in BEGINNINGS if pattern.match(beginning)), ending)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What Windows lacks: locks of files, opening without waiting, holding back an interrupt.
+
+There, nothing is locked and no interrupt is held back; bags and results are worked on all the same.
+"""
+
+import os
+import signal
+
+try:
+    import fcntl  # not on Windows
+except ModuleNotFoundError:
+    LOCKS = False
+else:
+    LOCKS = True
+
+AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags for opening a file as it is, without waiting for who writes into a pipe."""
+NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+"""Flag for opening a file, but not what a link leads to."""
+
+
+def lock(descriptor: int, *, wait: bool = False) -> None:
+    """Lock a file until it is closed, if this system has locks.
+
+    Raises
+    ------
+    OSError
+        If another process holds the lock and `wait` is false, or the file system has no locks.
+    """
+    if LOCKS:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
+def hold_interrupts(*, held: bool) -> None:
+    """Block Ctrl-C in this thread, or let it through, at once if it came meanwhile."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files among the arguments: what exists is not replaced, what is of another kind is named."""
+
+import pytest
+
+from selfcal_ros.cli.arguments import kind_of
+from selfcal_ros.cli.main import main
+from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.outputs import write_json
+from test.support.results import known_result
+from test.support.sources import ROOT
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """Go to a folder with a file of each kind, and those of the repository."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("bags", "config"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    write_json("R.json", result_to_dict(known_result(5, 8)[0]))
+    (tmp_path / "points.csv").write_text("x,y\n0,0\n")
+    (tmp_path / "part.nc").write_text("G0 X0 Y0\n")
+    (tmp_path / "stage.cal").write_text("; a table\n:START2D 1 2\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", [
+    "plot R.json -o out.svg", "table R.json -o out.csv", "report R.json -o out.html",
+    "apply R.json points.csv -o out.csv", "export siemens R.json -o out.ini --unit mm",
+    "cal export R.json -o out.cal", "solve bags/hu_exact --quiet -o out.json",
+    "cal orthogonality R.json -o out.cal"])
+def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
+    out = words.split()[words.split().index("-o") + 1]
+    (desk / out).write_text("mine")
+    assert main(words.split()) == 2
+    assert capsys.readouterr().err == (
+        f"selfcal {words.split()[0]}: {out}: the file exists; name another file, or replace it "
+        "with --force\n")
+    assert (desk / out).read_text() == "mine"
+    assert main([*words.split(), "--force"]) in (0, 5)
+    assert (desk / out).read_text() != "mine"
+
+
+def test_an_empty_file_and_a_device_are_written(desk):
+    (desk / "out.csv").touch()
+    assert main(["table", "R.json", "-o", "out.csv"]) == 0
+    assert main(["table", "R.json", "-o", "/dev/stderr"]) == 2  # its name has no ending
+
+
+def test_kinds_are_seen_in_the_files(desk):
+    assert [kind_of(name) for name in (
+        "bags/demo", "bags/demo/demo_0.mcap", "R.json", "config/plans/hu.yaml",
+        "config/simulations/demo.yaml", "config/params/cell.yaml", "stage.cal", "points.csv",
+        "part.nc", "nothing", "config", "bags/manifest.yaml")] == [
+        "a bag", "a bag", "a result", "a plan", "a simulation", "a parameter file of nodes",
+        "a calibration file", "a table of numbers", "a G-code program", "", "", ""]
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    ("apply points.csv R.json -o o.csv", "points.csv: is a table of numbers, and R.json is a "
+     "result: they are swapped; write `selfcal apply R.json points.csv -o o.csv`"),
+    ("recheck bags/demo R.json", "bags/demo: is a bag, and R.json is a result: they are swapped; "
+     "write `selfcal recheck R.json bags/demo`"),
+    ("cal verify stage.cal R.json", "stage.cal: is a calibration file, and R.json is a result: "
+     "they are swapped; write `selfcal cal verify R.json stage.cal`"),
+    ("solve R.json", "R.json: is a result, and a bag is needed here; `selfcal report R.json` "
+     "shows it"),
+    ("report bags/demo", "bags/demo: is a bag, and a result is needed here; a map is computed "
+     "from it with `selfcal solve bags/demo -o RESULT.json`"),
+    ("plan check config/simulations/demo.yaml", "config/simulations/demo.yaml: is a simulation, "
+     "and a plan is needed here; `selfcal simulate config/simulations/demo.yaml -o BAG` writes "
+     "its bag"),
+    ("solve bags/demo --params config/plans/hu.yaml", "config/plans/hu.yaml: is a plan, and a "
+     "parameter file of nodes is needed here; `selfcal plan check config/plans/hu.yaml` says "
+     "what it determines")])
+def test_a_file_in_the_place_of_another_is_named(desk, capsys, words, said):
+    assert main(words.split()) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"selfcal {words.split()[0]}: {said}\n" and not printed.out
+
+
+def test_a_file_before_the_word_that_chooses(desk, capsys):
+    with pytest.raises(SystemExit):
+        main(["export", "R.json", "siemens", "-o", "o.ini"])
+    assert "'R.json' is a file, and kmotion|pmac|" in capsys.readouterr().err
+
+
+def test_an_error_of_the_right_file_stays(desk, capsys):
+    (desk / "points.csv").write_text("x,z\n0,0\n")
+    assert main(["apply", "R.json", "points.csv", "-o", "o.csv"]) == 2
+    assert "points.csv:1: " in capsys.readouterr().err
+
+
+def test_what_is_not_kept_is_said(desk, capsys):
+    assert main(["solve", "bags/hu_exact"]) == 0
+    assert capsys.readouterr().out.endswith("result: not kept; -o RESULT.json writes it\n")
+    assert main(["solve", "bags/hu_exact", "--json"]) == 0
+    assert "not kept" not in "".join(capsys.readouterr())
