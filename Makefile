@@ -27,10 +27,13 @@ build/oracles/.complete: tools/oracle-requirements.txt tools/printer-requirement
 	@mkdir -p build/oracles; for pins in $^; do $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--no-deps --require-hashes --upgrade --target build/oracles -r $$pins \
 		|| echo "test: what $$pins names is left out: it cannot be installed"; done; touch $@
+build/machines/.complete: tools/machine-requirements.txt | setup
+	@mkdir -p build/machines; $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes \
+		--upgrade --target build/machines -r $< && touch $@ || echo "test: pymmcore and pyserial are left out: they cannot be installed"
 build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
 	@$(BIN)/python $< $(@D) || true
-test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd
-	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
+test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd build/machines/.complete
+	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles:$(CURDIR)/build/machines$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
 test-oldest:  # with the libraries of Ubuntu 24.04; e.g. make test-oldest TESTS=test/laser
 	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \
 		echo "test-oldest: apt install pkg-config libfreetype-dev libqhull-dev" >&2; exit 2; }

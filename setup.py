@@ -37,7 +37,11 @@ setup(
                       "rosbags>=0.10", "matplotlib>=3.6", "rich>=13", "argcomplete>=3",
                       "threadpoolctl>=3", "pillow>=10", "lz4", "zstandard"],
     extras_require={"test": ["pytest>=7.4", "hypothesis>=6.98"],  # colcon looks for pytest here
-                    "dask": ["distributed>=2024.1"], "pdf": ["weasyprint>=62"]},
+                    "dask": ["distributed>=2024.1"],
+                    "gcode": ["pyserial>=3.5"],  # BSD
+                    "camera": ["opencv-python-headless>=4.8"],  # Apache-2.0
+                    "micromanager": ["pymmcore>=11.1"],  # LGPL: loaded, never shipped
+                    "pdf": ["weasyprint>=62"]},
     python_requires=">=3.12",
     zip_safe=False,
     maintainer="selfcal_ros maintainers",

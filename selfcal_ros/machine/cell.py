@@ -24,6 +24,8 @@ AXES = ("x", "y", "theta")
 ENTRY_POINTS = "selfcal.machines"
 SHIPPED = {
     "simulated": "selfcal_ros.machine.simulated:SimulatedMachine",
+    "gcode": "selfcal_ros.machine.gcode:GcodeMachine",
+    "micromanager": "selfcal_ros.machine.micromanager:MicroManagerMachine",
 }
 """Machines of this package; further ones are entry points of the group ``selfcal.machines``."""
 DEFAULT_STEP_M = 1e-4
@@ -226,8 +228,8 @@ def open_machine(cell: Cell) -> Machine:
     MachineError
         If it cannot be reached.
     """
-    kind = _class_of(cell)
-    _check_keys(kind, cell)
+    kind = class_of(cell)
+    check_keys(kind, cell)
     keys = dict(cell.keys)
     if "folder" in inspect.signature(kind).parameters and "folder" not in keys:
         keys["folder"] = str(cell.path.parent)
@@ -243,7 +245,8 @@ def open_machine(cell: Cell) -> Machine:
     return cast(Machine, machine)
 
 
-def _class_of(cell: Cell) -> Any:
+def class_of(cell: Cell) -> Any:
+    """Return the class of a cell's machine; raises InputError like `open_machine`."""
     named = known_machines()
     target = cell.machine if ":" in cell.machine else named.get(cell.machine, "")
     where = f"{cell.path}: machine"
@@ -275,7 +278,7 @@ def _class_of(cell: Cell) -> Any:
     return getattr(found, name)
 
 
-def _check_keys(kind: Any, cell: Cell) -> None:
+def check_keys(kind: Any, cell: Cell) -> None:
     """Refuse keys that the class does not take, and missing ones."""
     where = f"{cell.path}: {cell.name}"
     parameters = {name: item for name, item in inspect.signature(kind).parameters.items()

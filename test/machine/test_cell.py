@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """CELL.yaml: keys, machines by name, values written into it."""
 
+from pathlib import Path
+
 import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.machine import MachineError
-from selfcal_ros.machine.cell import open_machine, read_cell, with_values
+from selfcal_ros.machine.cell import check_keys, class_of, open_machine, read_cell, with_values
 from selfcal_ros.machine.simulated import SimulatedMachine
 from selfcal_ros.model.readings import Sense
 from test.support.cells import CELL, write_cell
@@ -115,3 +117,10 @@ def test_limits(tmp_path, axis, value, said):
     cell.require_limits("x", 0.01, "a move")
     with pytest.raises(MachineError, match=said):
         cell.require_limits(axis, value, "a move")
+
+
+@pytest.mark.parametrize("path", sorted(
+    (Path(__file__).parents[2] / "config/cells").glob("*.yaml")), ids=lambda path: path.name)
+def test_the_shipped_cells_have_only_known_keys(path):
+    cell = read_cell(path)
+    check_keys(class_of(cell), cell)

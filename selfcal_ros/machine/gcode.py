@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The machine ``gcode``: GRBL, Marlin, Klipper and LinuxCNC, over a serial port or TCP.
+
+Positions are the machine's own coordinates: GRBL's MPos, the steps that Marlin counts, Klipper's
+M114, LinuxCNC's absolute actual position. Moves are G1 in mm with the feed rate of CELL.yaml, with
+G53 where the dialect has it.
+"""
+
+import math
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from selfcal_ros.machine.interface import Image, MachineError, Offset
+from selfcal_ros.machine.lines import Lines
+from selfcal_ros.units import M_PER_MM, MM_PER_M
+
+DIALECTS = ("grbl", "marlin", "klipper", "linuxcnc")
+LETTERS = {"x": "X", "y": "Y", "theta": "A"}
+FEED_HOLD, RESET, STATUS = b"!", b"\x18", b"?"
+ALLOWANCE = 2.0
+"""Longest time of a move over that at the feed rate."""
+PATIENCE_S = 5.0
+"""The same for its acceleration, and for answers."""
+POLL_S = 0.02
+HOLD_S = 0.3
+"""Time from a feed hold to the reset: a reset during the motion loses the position."""
+MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
+
+
+@dataclass(frozen=True)
+class _Travel:
+    """A move: axes in the order of the machine, mm and degrees."""
+
+    words: str
+    longest_s: float
+
+
+class GcodeMachine:
+    """A controller that takes G-code lines, and a camera.
+
+    Parameters
+    ----------
+    port : str
+        Serial port, or ``socket://host:port``.
+    dialect : str
+        ``grbl``, ``marlin``, ``klipper`` or ``linuxcnc`` (linuxcncrsh).
+    feed : float
+        Speed of moves, mm/min.
+    baud : int, optional
+        Rate of a serial port.
+    axes : list of str, optional
+        ``[x, y]`` or ``[x, y, theta]``; theta is the axis A, in degrees.
+    camera : int or str, optional
+        Number or address for OpenCV's VideoCapture; None = no images.
+    width, height : int, optional
+        Size of the image to ask for.
+    password, enable_password : str, optional
+        Of linuxcncrsh.
+
+    Raises
+    ------
+    MachineError
+        If the controller does not answer, or is in alarm.
+    """
+
+    def __init__(self, port: str, dialect: str, feed: float, baud: int = 115200,
+                 axes: Sequence[str] = ("x", "y"), camera: int | str | None = None,
+                 width: int = 0, height: int = 0, password: str = "EMC",
+                 enable_password: str = "EMCTOO") -> None:
+        if dialect not in DIALECTS:
+            raise MachineError(f"the dialect '{dialect}' is unknown", "gcode: dialect",
+                               f"choose one of {', '.join(DIALECTS)}")
+        if not (math.isfinite(feed) and feed > 0):
+            raise MachineError(f"a feed of {feed} mm/min", "gcode: feed", "give mm/min above 0")
+        self.axes = tuple(axes)
+        self._feed, self._dialect = float(feed), dialect
+        self._camera = None
+        self._lines = Lines(port, baud, PATIENCE_S)
+        try:
+            self._talk = _TALKS[dialect](self._lines, self.axes, (password, enable_password))
+            if camera is not None:
+                from selfcal_ros.machine.video import VideoCamera  # extra camera
+                self._camera = VideoCamera(camera, width, height)
+        except BaseException:
+            self._lines.close()
+            raise
+
+    def position(self) -> tuple[float, ...]:
+        """Return the indicated position, m and rad."""
+        native = self._talk.position()
+        return tuple(_to_si(axis, value) for axis, value in zip(self.axes, native, strict=True))
+
+    def move_to(self, position: tuple[float, ...]) -> None:
+        """Move, and wait for the end of the motion."""
+        here = self._talk.position()
+        native = [_from_si(axis, value) for axis, value in zip(self.axes, position, strict=True)]
+        way = math.hypot(*(to - at for to, at in zip(native, here, strict=True)))
+        words = " ".join(f"{LETTERS[axis]}{value:.6f}" for axis, value in zip(
+            self.axes, native, strict=True))
+        longest_s = ALLOWANCE * way / self._feed * 60 + PATIENCE_S
+        try:
+            self._talk.move(_Travel(f"{words} F{self._feed:g}", longest_s))
+        except MachineError:
+            self.stop()
+            raise
+
+    def image(self) -> Image | None:
+        """Expose; None without a camera."""
+        return self._camera.image() if self._camera else None
+
+    def offsets(self) -> list[Offset]:
+        """Return nothing: without a camera nothing is seen."""
+        return []
+
+    def stop(self) -> None:
+        """Stop at once, as far as the connection still carries it."""
+        try:
+            self._talk.stop()
+        except MachineError:  # said by whatever failed before
+            return
+
+    def close(self) -> None:
+        """Release port and camera."""
+        if self._camera:
+            self._camera.close()
+        self._lines.close()
+
+
+def _to_si(axis: str, value: float) -> float:
+    return math.radians(value) if axis == "theta" else value * M_PER_MM
+
+
+def _from_si(axis: str, value: float) -> float:
+    return math.degrees(value) if axis == "theta" else value * MM_PER_M
+
+
+class _Talk:
+    """How a dialect moves, stops and tells its position."""
+
+    def __init__(self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]) -> None:
+        self._lines, self._axes, self._passwords = lines, axes, passwords
+        self._begin()
+
+    def _begin(self) -> None:
+        """Bring the controller to mm and absolute coordinates."""
+
+    def _ok(self, line: str, timeout_s: float = PATIENCE_S) -> list[str]:
+        """Send a line, return what comes before its ``ok``."""
+        self._lines.send(line)
+        before: list[str] = []
+        deadline = time.monotonic() + timeout_s
+        while True:
+            answer = self._lines.receive(max(deadline - time.monotonic(), 0.01))
+            if answer.lower() == "ok" or answer.lower().startswith("ok "):
+                return before
+            self._refuse(answer, line)
+            if not answer.startswith(("echo:busy", "//")):
+                before.append(answer)
+            else:  # it is alive
+                deadline = time.monotonic() + timeout_s
+
+    def _refuse(self, answer: str, line: str) -> None:
+        """Raise if an answer is an error."""
+        low = answer.lower()
+        if low.startswith(("error", "alarm", "!!")) or "kill()" in low or "halted" in low:
+            raise MachineError(f"'{line}' was answered by '{answer}'", "controller",
+                               "check limit switches, soft limits and homing; reset it")
+
+
+class _Grbl(_Talk):
+    """GRBL 1.1: real-time status reports ``<Idle|MPos:1.000,2.000,0.000|...>``."""
+
+    def _begin(self) -> None:
+        self._lines.send("")
+        self._until_quiet()
+        self._status()  # raises if it does not answer, or is in alarm
+        self._ok("G21 G90")
+
+    def _until_quiet(self) -> None:
+        """Read the greeting away; a controller that was open before says nothing."""
+        try:
+            while True:
+                self._lines.receive(2.0)
+        except MachineError as error:
+            if "no answer" not in error.what:
+                raise
+
+    def _status(self) -> tuple[str, list[float]]:
+        """Return the state, and the machine's position, mm."""
+        self._lines.send_raw(STATUS)
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            answer = self._lines.receive()
+            if answer.startswith("<"):
+                return self._parsed(answer)
+            self._refuse(answer, "?")
+        raise MachineError("no status report", "controller", "check the dialect")
+
+    def _parsed(self, answer: str) -> tuple[str, list[float]]:
+        state, *fields = answer.strip("<>").split("|")
+        parts = dict(part.partition(":")[::2] for part in fields)
+        state = state.partition(":")[0].lower()
+        if state in ("alarm", "door", "sleep"):
+            raise MachineError(f"the controller is in state '{state}'", "controller",
+                               "find out why, then home or unlock it ($H, $X)")
+        if "WCO" in parts:
+            self._offset = _numbers(parts["WCO"])
+        if "MPos" in parts:
+            return state, self._chosen(_numbers(parts["MPos"]))
+        if "WPos" in parts and hasattr(self, "_offset"):
+            at = [value + off for value, off in zip(
+                _numbers(parts["WPos"]), self._offset, strict=True)]
+            return state, self._chosen(at)
+        raise MachineError(f"its report '{answer}' has no machine position", "controller",
+                           "set $10=1")
+
+    def _chosen(self, values: list[float]) -> list[float]:
+        if len(values) < len(self._axes):
+            raise MachineError(f"it reports {len(values)} axes", "controller", "correct axes")
+        return [values[index] for index in ([0, 1, 3] if len(values) > 3 else [0, 1, 2])][
+            :len(self._axes)]
+
+    def position(self) -> list[float]:
+        return self._status()[1]
+
+    def move(self, travel: _Travel) -> None:
+        self._ok(f"G53 G1 {travel.words}", travel.longest_s)
+        deadline = time.monotonic() + travel.longest_s
+        while self._status()[0] in MOTION_STATES:
+            if time.monotonic() > deadline:
+                raise MachineError(f"the move has not ended in {travel.longest_s:.3g} s",
+                                   "controller", "check feed and drives")
+            time.sleep(POLL_S)
+
+    def stop(self) -> None:
+        self._lines.send_raw(FEED_HOLD)
+        time.sleep(HOLD_S)
+        self._lines.send_raw(RESET)
+
+
+class _Marlin(_Talk):
+    """Marlin: ``M400`` waits for the end of motion; ``M114 R`` tells the steps that were made.
+
+    Its X: has two decimals, 10 um: the steps over the steps per mm (``M92``) are finer.
+    """
+
+    QUERY, HALT, STEPS = "M114 R", b"M410\n", "M92"
+
+    def _begin(self) -> None:
+        self._lines.forget()
+        self._ok("G21", 3 * PATIENCE_S)  # a board that was reset by opening the port
+        self._ok("G90")
+        self._per_mm: dict[str, float] = {}
+        for answer in self._ok(self.STEPS) if self.STEPS else ():
+            self._per_mm |= {letter: float(value) for letter, value in re.findall(
+                r"\b([XYZABC])(\d+\.?\d*)", answer)}
+
+    def position(self) -> list[float]:
+        for answer in self._ok(self.QUERY):
+            told, _, counted = answer.partition("Count")
+            found = {letter: float(value) for letter, value in NUMBER.findall(told)}
+            found |= {letter: float(value) / self._per_mm[letter]
+                      for letter, value in NUMBER.findall(counted) if self._per_mm.get(letter)}
+            if {LETTERS[axis] for axis in self._axes} <= found.keys():
+                return [found[LETTERS[axis]] for axis in self._axes]
+        raise MachineError("M114 tells no position of all axes", "controller", "correct axes")
+
+    def move(self, travel: _Travel) -> None:
+        self._ok(f"G1 {travel.words}", travel.longest_s)
+        self._ok("M400", travel.longest_s)
+
+    def stop(self) -> None:
+        self._lines.send_raw(self.HALT)
+        time.sleep(HOLD_S)
+        self._lines.forget()  # its ok
+
+
+class _Klipper(_Marlin):
+    """Klipper's serial port (/tmp/printer): ``M114``; ``M112`` is its only stop."""
+
+    QUERY, HALT, STEPS = "M114", b"M112\n", ""
+
+
+class _LinuxCnc(_Talk):
+    """linuxcncrsh: ``get abs_act_pos`` tells the actual machine position, ``set mdi`` moves."""
+
+    ORDER = "XYZABCUVW"
+
+    def _begin(self) -> None:
+        password, enable = self._passwords
+        self._lines.send(f"hello {password} selfcal 1.0")
+        answer = self._lines.receive()
+        if answer.startswith("hello"):  # its echo
+            answer = self._lines.receive()
+        if not answer.upper().startswith("HELLO ACK"):
+            raise MachineError(f"linuxcncrsh answered '{answer}'", "controller", "check password")
+        self._lines.send("set echo off")
+        for words in ("verbose on", f"enable {enable}", "mode mdi", "set_wait done",
+                      "mdi G21 G90"):
+            self._set(words)
+
+    def _set(self, words: str, timeout_s: float = PATIENCE_S) -> None:
+        """Send a set command, and wait for its acknowledgement; its echo is passed over."""
+        self._lines.send(f"set {words}")
+        deadline = time.monotonic() + timeout_s
+        while True:
+            answer = self._lines.receive(max(deadline - time.monotonic(), 0.01)).upper()
+            if answer.endswith("ACK"):
+                return
+            if answer.endswith("NAK") or answer.startswith("ERROR"):
+                raise MachineError(f"'set {words}' was answered by '{answer}'", "controller",
+                                   "release the emergency stop, switch the machine on, home it")
+
+    def position(self) -> list[float]:
+        self._lines.send("get abs_act_pos")
+        answer = self._lines.receive()
+        while not answer.upper().startswith("ABS_ACT_POS"):
+            answer = self._lines.receive()
+        values = [float(word) for word in answer.split()[1:]]
+        places = [self.ORDER.index(LETTERS[axis]) for axis in self._axes]
+        if max(places) >= len(values):
+            raise MachineError(f"its position is '{answer}'", "controller", "correct axes")
+        return [values[place] for place in places]
+
+    def move(self, travel: _Travel) -> None:
+        self._set(f"mdi G53 G1 {travel.words}", travel.longest_s)
+
+    def stop(self) -> None:
+        self._lines.send("set abort")
+
+
+NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.split(",")]
+
+
+_TALKS: dict[str, type] = {"grbl": _Grbl, "marlin": _Marlin, "klipper": _Klipper,
+                           "linuxcnc": _LinuxCnc}

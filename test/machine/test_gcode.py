@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Controllers that take G-code: each dialect measures a plan; faults are named and stop it."""
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.machine import MachineError
+from selfcal_ros.machine.gcode import GcodeMachine
+from selfcal_ros.machine.measuring import Run
+from test.machine.test_measuring import away_from
+from test.support.cells import CELL, Agreeing, write_cell
+from test.support.firmware import Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
+
+pytest.importorskip("serial")
+KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
+
+
+class WithPlate(GcodeMachine):
+    """A plate lies under the camera of the controller's machine."""
+
+    def __init__(self, firmware, simulated, **keys) -> None:
+        self._firmware, self._simulated = firmware, simulated
+        super().__init__(feed=6000.0, **keys)
+
+    def place(self, placing) -> None:
+        self._simulated.place(placing)
+
+    def image(self):
+        self._simulated.move_to((self.position()[0], self.position()[1], 0.0))
+        return self._simulated.image()
+
+
+@pytest.mark.parametrize("dialect", KINDS)
+@pytest.mark.parametrize("over", [over_tcp, over_pty])
+def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
+    quiet = "servo_sigma: 0.0"
+    cell, simulated = write_cell(
+        tmp_path, camera=True, simulation=(
+            "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
+            f"cell: {{{quiet}}}\n"),
+        plan="plan_id: p\nartifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}\n"
+             "check_stops: {marks: 2, offset: 25e-6}\nviews:\n  - {name: a, repeats: 2}\n"
+             "  - {name: b, rotation_deg: 90}\n  - {name: c, translation_pitch: [1, 0]}\n",
+        cell=CELL)
+    firmware = KINDS[dialect]()
+    with over(firmware) as port:
+        machine = WithPlate(firmware, simulated, port=port, dialect=dialect)
+        try:
+            Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
+                Agreeing()).measure()
+        finally:
+            machine.close()
+    away, _ = away_from(simulated.truth, tmp_path / "bag")
+    assert np.abs(away).max() < 5e-8
+    moves = [line for line in firmware.lines if "G1" in line.split()]
+    assert all("F6000" in line for line in moves)
+
+
+@pytest.mark.parametrize("dialect", KINDS)
+def test_positions_are_mm_of_the_controller(dialect):
+    firmware = KINDS[dialect]()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        machine.move_to((0.0125, -0.0025))
+        assert (firmware.at["X"], firmware.at["Y"]) == (12.5, -2.5)
+        assert machine.position() == pytest.approx((0.0125, -0.0025), abs=1e-12)
+        machine.stop()
+        machine.position()
+        assert firmware.stopped
+        machine.close()
+
+
+def test_the_rotary_axis_is_a_in_degrees():
+    firmware = LinuxCnc()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "linuxcnc", feed=6000.0, axes=["x", "y", "theta"])
+        machine.move_to((0.0, 0.0, np.pi / 2))
+        assert firmware.at["A"] == pytest.approx(90.0)
+        assert machine.position()[2] == pytest.approx(np.pi / 2)
+        machine.close()
+
+
+@pytest.mark.parametrize("dialect", KINDS)
+def test_an_alarm_in_the_middle_stops_and_is_named(dialect):
+    firmware = KINDS[dialect]()
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, dialect, feed=6000.0)
+        firmware.alarm = "limit switch"
+        with pytest.raises(MachineError, match=r"answered by|state 'alarm'"):
+            machine.move_to((0.001, 0.0))
+        machine.close()
+
+
+@pytest.mark.parametrize("over", [over_tcp, over_pty])
+def test_a_lost_connection_is_named(over):
+    firmware = Grbl()
+    with over(firmware) as port:
+        machine = GcodeMachine(port, "grbl", feed=6000.0)
+        firmware.dead = True
+        with pytest.raises(MachineError, match=r"connection was lost|no answer"):
+            machine.move_to((0.001, 0.0))
+        machine.close()
+
+
+@pytest.mark.parametrize(("keys", "said"), [
+    ({"dialect": "grbel"}, "the dialect 'grbel' is unknown"),
+    ({"feed": 0.0}, "a feed of 0.0 mm/min"),
+    ({"port": "/dev/there_is_none"}, "the port cannot be opened")])
+def test_keys_that_cannot_be(keys, said):
+    with pytest.raises(MachineError, match=said):
+        GcodeMachine(**{"port": "socket://127.0.0.1:1", "dialect": "grbl", "feed": 1.0} | keys)
+
+
+def test_a_password_that_is_refused():
+    with over_tcp(LinuxCnc()) as port, pytest.raises(MachineError, match="check password"):
+        GcodeMachine(port, "linuxcnc", feed=1.0, password="other")

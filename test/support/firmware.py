@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Controllers written from the documents of their protocols, over TCP and over a pty.
+
+They keep the resolution of the real ones: 1 um in GRBL's report, 1/80 mm in Marlin's steps.
+"""
+
+import contextlib
+import os
+import pty
+import re
+import socket
+import threading
+import tty
+
+WORD = re.compile(r"([XYAF])(-?\d+\.?\d*)")
+
+
+class Firmware:
+    """Answers lines and real-time bytes; moves end after two status reports."""
+
+    greeting, realtime = b"", b""
+
+    def __init__(self) -> None:
+        self.at = {"X": 0.0, "Y": 0.0, "A": 0.0}
+        self.lines, self.stopped, self.dead, self.alarm = [], 0, False, ""
+        self._moving = 0
+
+    def answer(self, line: str) -> bytes:
+        raise AssertionError(line)
+
+    def byte(self, byte: bytes) -> bytes:
+        raise AssertionError(byte)
+
+    def move(self, line: str) -> None:
+        self.at |= {letter: float(value) for letter, value in WORD.findall(line) if letter != "F"}
+        self._moving = 2
+
+    def feed(self, data: bytes, rest: bytearray) -> bytes:
+        """Take bytes, return what is sent back."""
+        out = b""
+        for value in data:
+            byte = bytes([value])
+            if byte in self.realtime and byte:
+                out += self.byte(byte)
+            elif byte in b"\r\n":
+                line, rest[:] = rest.decode(), b""
+                self.lines.append(line)
+                out += self.answer(line)
+            else:
+                rest += byte
+        return out
+
+
+class Grbl(Firmware):
+    greeting, realtime = b"\r\nGrbl 1.1h ['$' for help]\r\n", b"?!\x18"
+
+    def answer(self, line):
+        if self.alarm:
+            return b"error:9\r\n"
+        if " G1 " in f" {line} ":
+            if "G53" not in line or "F" not in line:
+                return b"error:22\r\n"
+            self.move(line)
+        return b"ok\r\n"
+
+    def byte(self, byte):
+        if byte != b"?":
+            self.stopped += 1
+            return self.greeting if byte == b"\x18" else b""
+        self._moving = max(self._moving - 1, 0)
+        state = "Alarm" if self.alarm else "Run" if self._moving else "Idle"
+        return (f"<{state}|MPos:{self.at['X']:.3f},{self.at['Y']:.3f},0.000|FS:0,0>\r\n").encode()
+
+
+class Marlin(Firmware):
+    greeting = b"start\nMarlin 2.1.2\n"
+    PER_MM = 80.0
+
+    def answer(self, line):
+        if self.alarm:
+            return b"Error:Printer halted. kill() called!\n"
+        if line == "M92":
+            return b"echo:  M92 X80.00 Y80.00 Z400.00 E93.00\nok\n"
+        if line == "M114 R":
+            steps = {letter: round(value * self.PER_MM) for letter, value in self.at.items()}
+            return (f"X:{steps['X'] / 80:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
+                    f"Count X:{steps['X']} Y:{steps['Y']} Z:0\nok\n").encode()
+        if line == "M410":
+            self.stopped += 1
+        elif line.startswith("G1"):
+            self.move(line)
+        elif line == "M400":
+            return b"echo:busy: processing\nok\n"
+        return b"ok P15 B3\n"
+
+
+class Klipper(Firmware):
+    def answer(self, line):
+        if self.alarm:
+            return b"!! Must home axis first\nok\n"
+        if line == "M114":
+            return f"X:{self.at['X']:.3f} Y:{self.at['Y']:.3f} Z:0.000 E:0.000\nok\n".encode()
+        if line == "M112":
+            self.stopped += 1
+        elif line.startswith("G1"):
+            self.move(line)
+        return b"// a note\nok\n"
+
+
+class LinuxCnc(Firmware):
+    """linuxcncrsh: sets are answered once verbose is on; every command is echoed until echo off."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._echo, self._verbose, self._enabled = True, False, False
+
+    def answer(self, line):
+        echo = f"{line}\r\n".encode() if self._echo else b""
+        word, *rest = line.split()
+        if word == "hello":
+            return echo + (b"HELLO ACK EMCNETSVR 1.1\r\n" if rest[0] == "EMC" else b"HELLO NAK\r\n")
+        if line == "get abs_act_pos":
+            return echo + (f"ABS_ACT_POS {self.at['X']:.6f} {self.at['Y']:.6f} 0.000000 "
+                           f"{self.at['A']:.6f} 0.000000 0.000000\r\n").encode()
+        if rest[:2] == ["echo", "off"]:
+            self._echo = False
+        elif rest[:2] == ["verbose", "on"]:
+            self._verbose = True
+        elif rest[0] == "enable":
+            self._enabled = rest[1] == "EMCTOO"
+            if not self._enabled:
+                return echo + b"SET ENABLE NAK\r\n"
+        elif rest[0] == "abort":
+            self.stopped += 1
+        elif self.alarm or not self._enabled:
+            return echo + f"SET {rest[0].upper()} NAK\r\n".encode()
+        elif "G1" in rest:
+            self.move(line)
+        return echo + (f"SET {rest[0].upper()} ACK\r\n".encode() if self._verbose else b"")
+
+
+@contextlib.contextmanager
+def over_tcp(firmware):
+    """Yield the address of a firmware behind a socket."""
+    server = socket.create_server(("127.0.0.1", 0))
+    connections = []
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):
+            connection, _ = server.accept()
+            connections.append(connection)
+            _talk(firmware, lambda: connection.recv(4096), connection.sendall)
+            connection.close()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+    finally:
+        server.close()
+        for connection in connections:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+            connection.close()
+        thread.join(5)
+
+
+@contextlib.contextmanager
+def over_pty(firmware):
+    """Yield the name of a serial port with a firmware behind it."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    thread = threading.Thread(target=_talk, daemon=True, args=(
+        firmware, lambda: os.read(ours, 4096), lambda data: os.write(ours, data)))
+    thread.start()
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        os.close(theirs)
+        thread.join(5)
+        os.close(ours)
+
+
+def _talk(firmware, read, write) -> None:
+    rest = bytearray()
+    with contextlib.suppress(OSError):
+        write(firmware.greeting)
+        while data := read():
+            if firmware.dead:
+                return
+            write(firmware.feed(data, rest))
