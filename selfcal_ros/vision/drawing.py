@@ -34,7 +34,7 @@ def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: f
     grey = ((pixels - low) * (255 / max(high - low, 1.0))).astype(np.uint8)
     picture = Image.fromarray(grey).convert("RGB")
     draw = ImageDraw.Draw(picture)
-    line = max(1, round(min(pixels.shape) / 300))
+    line = max(1, round(size_px / 12))
     radius = RADIUS * size_px
     for u, v in marks:
         draw.ellipse([u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line)
