@@ -9,6 +9,7 @@ NODES = ("measurement_collector", "pose_sequencer", "solver", "compensator", "ma
          "bag_player", "bag_recorder", "cell_driver", "stage_simulator")
 
 
+HOME = "https://selfcal-ros.example"
 VERBS = runpy.run_path(str(Path(NAME, "cli", "verbs.py")))
 
 
@@ -21,11 +22,12 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=runpy.run_path(str(Path(NAME, "__init__.py")))["__version__"],
     # the message definitions go along, so that bags can be read and written without ROS
     packages=[*find_packages(include=[NAME, f"{NAME}.*"]), f"{NAME}.msg_text"],
     package_dir={f"{NAME}.msg_text": "msg_defs/msg"},
-    package_data={f"{NAME}.msg_text": ["*.msg"], f"{NAME}.reporting": ["assets/*.js"]},
+    package_data={f"{NAME}.msg_text": ["*.msg"], f"{NAME}.reporting": ["assets/*.js"],
+                  NAME: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -33,7 +35,7 @@ setup(
         *share("config"),
     ],
     # at least what Ubuntu 24.04 has (`make test-oldest`); what it has not comes from PyPI
-    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "pyyaml", "mcap>=1.1",
+    install_requires=["numpy>=1.26", "scipy>=1.11", "pyyaml", "mcap>=1.1",
                       "rosbags>=0.10", "matplotlib>=3.6", "rich>=13", "argcomplete>=3",
                       "threadpoolctl>=3", "pillow>=10", "lz4", "zstandard"],
     extras_require={"test": ["pytest>=7.4", "hypothesis>=6.98"],  # colcon looks for pytest here
@@ -48,6 +50,19 @@ setup(
     maintainer_email="maintainers@selfcal-ros.example",
     description="Self-calibration of precision XY-theta stages in the machine, "
                 "without a better standard.",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    url=HOME,
+    project_urls={"Documentation": f"{HOME}/docs", "Source": f"{HOME}/source",
+                  "Changelog": f"{HOME}/changelog"},
+    keywords=["calibration", "self-calibration", "metrology", "uncertainty", "ROS 2", "stage"],
+    classifiers=["Development Status :: 4 - Beta", "Environment :: Console",
+                 "Intended Audience :: Manufacturing", "Intended Audience :: Science/Research",
+                 "Operating System :: OS Independent",
+                 "Programming Language :: Python :: 3",
+                 "Programming Language :: Python :: 3.12",
+                 "Programming Language :: Python :: 3.13",
+                 "Topic :: Scientific/Engineering", "Typing :: Typed"],
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

@@ -19,9 +19,16 @@ from selfcal_ros import __version__
 from selfcal_ros.outputs import write_json
 
 ROOT = Path(__file__).parents[1]
-STATED = {"empy": "LGPL-2.1-or-later", "ros-fastcdr": "Apache-2.0", "ros-fastrtps": "Apache-2.0",
+STATED = {"apsw": "Zlib", "empy": "LGPL-2.1-or-later",
+          "docutils": "LicenseRef-Public-Domain AND BSD-2-Clause AND GPL-3.0-or-later",
+          "ros-fastcdr": "Apache-2.0", "ros-fastrtps": "Apache-2.0",
           "setuptools": "MIT"}
 """Licences that neither the metadata of a wheel nor its package.xml name; from their sources."""
+SPDX = {"Apache Software License": "Apache-2.0", "Apache License 2.0": "Apache-2.0",
+        "Apache 2.0": "Apache-2.0", "BSD License": "BSD-3-Clause", "BSD": "BSD-3-Clause",
+        "MIT License": "MIT", "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+        "Python Software Foundation License": "PSF-2.0", "zlib License": "Zlib"}
+"""Names of licences in wheels and manifests -> their identifiers, https://spdx.org/licenses."""
 
 
 def pins() -> dict[str, tuple[str, list[str]]]:
@@ -51,7 +58,7 @@ def required() -> set[str]:
 
 
 def licence(name: str) -> str:
-    """Return what an installed wheel says of its licence."""
+    """Return what an installed wheel says of its licence, as an SPDX expression."""
     about = metadata(name)
     stated = STATED.get(name) or about.get("License-Expression")
     if stated:
@@ -59,13 +66,14 @@ def licence(name: str) -> str:
     classifiers = [line.split(" :: ")[-1] for line in about.get_all("Classifier") or ()
                    if line.startswith("License ::")]
     if classifiers:
-        return " OR ".join(classifiers)
+        return " OR ".join(SPDX.get(name, name) for name in classifiers)
     package = re.sub("^ros-(jazzy-)?", "", name).replace("-", "_")
     manifest = ROOT / ".venv/share" / package / "package.xml"
     if manifest.is_file():
         found = ElementTree.parse(manifest).getroot().findall("license")
-        return " AND ".join(str(item.text).strip() for item in found)
-    return about["License"]
+        names = [str(item.text).strip() for item in found]
+        return " AND ".join(SPDX.get(name, name) for name in names)
+    return SPDX.get(about["License"], about["License"])
 
 
 def bill() -> dict:
@@ -79,7 +87,7 @@ def bill() -> dict:
             "type": "library", "name": name, "version": version, "scope": scope,
             "purl": f"pkg:pypi/{canonicalize_name(name)}@{version}",
             "hashes": [{"alg": "SHA-256", "content": digest} for digest in hashes],
-            "licenses": [{"license": {"name": licence(name)}}]})
+            "licenses": [{"expression": licence(name)}]})
     about = {"type": "application", "name": "selfcal_ros", "version": __version__,
              "licenses": [{"license": {"id": "Apache-2.0"}}]}
     return {"bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,
@@ -88,5 +96,5 @@ def bill() -> dict:
 
 if __name__ == "__main__":
     write_json(ROOT / "sbom.json", bill())
-    print(json.dumps({part["name"]: part["licenses"][0]["license"]["name"]
+    print(json.dumps({part["name"]: part["licenses"][0]["expression"]
                       for part in bill()["components"] if part["scope"] == "required"}, indent=1))

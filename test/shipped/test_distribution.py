@@ -8,11 +8,13 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from email import message_from_bytes
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
 
+from selfcal_ros import __version__
 from selfcal_ros.files import read_json
 from tools.sbom import bill, pins
 
@@ -65,6 +67,22 @@ def test_the_wheel_holds_every_module_message_and_configuration(wheel):
     assert not [name for name in names if name.startswith(("test", "tools", "bags"))]
 
 
+def test_the_wheel_describes_itself(wheel):
+    """One version; what it needs, and no tool of its building; README; types."""
+    with zipfile.ZipFile(wheel) as file:
+        [place] = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+        about = message_from_bytes(file.read(place))
+        assert "selfcal_ros/py.typed" in file.namelist()
+    assert about["Version"] == __version__ == "0.4.0"
+    needs = {re.match(r"[\w-]+", text)[0] for text in about.get_all("Requires-Dist")}
+    assert "numpy" in needs and "setuptools" not in needs
+    assert about["Description-Content-Type"] == "text/markdown"
+    assert about.get_payload() == (ROOT / "README.md").read_text() or about.get_payload(
+        decode=True).decode().strip() == (ROOT / "README.md").read_text().strip()
+    assert "Programming Language :: Python :: 3.13" in about.get_all("Classifier")
+    assert about.get_all("Project-URL")
+
+
 def test_the_wheel_solves_a_bag_without_the_clone(wheel, tmp_path):
     run(tmp_path, "-m", "pip", "-q", "--disable-pip-version-check", "install", "--no-deps",
         "--no-index", "--target", str(tmp_path / "site"), str(wheel))
@@ -111,10 +129,11 @@ def test_the_bill_of_materials_is_current():
 
 
 def test_no_library_of_the_product_is_under_the_gpl():
-    licences = {part["name"]: part["licenses"][0]["license"]["name"] for part in components()
+    licences = {part["name"]: part["licenses"][0]["expression"] for part in components()
                 if part["scope"] != "excluded"}
     assert {"numpy", "scipy", "rosbags", "mcap", "matplotlib", "threadpoolctl",
             "ros-rclpy"} <= set(licences)
     for name, licence in licences.items():
         assert licence, name
+        assert re.fullmatch(r"[\w.-]+( (AND|OR) [\w.-]+)*", licence), f"{name}: not SPDX's"
         assert not re.search(r"GPL|General Public", licence), f"{name}: {licence}"
