@@ -207,6 +207,24 @@ class Cells:
                 break
         return a, b
 
+    def solve_point_anywhere(self, s: float, t: float, scale: float) -> tuple[float, float]:
+        """Return `solve` of one finite position, bit for bit, faster; NaN next to unknown nodes."""
+        (nx, ny), side = self.shape, self.degree + 1
+        a, b, rest = s, t, REST * max(self.shape)
+        for _ in range(MAX_ITERATIONS):
+            at_a, at_b = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0)
+            i, j = min(int(at_a), nx - 2), min(int(at_b), ny - 2)
+            first, second = self.coefficients[i * (ny - 1) + j].tolist()
+            an = s - scale * _horner_point(first, at_a - i, at_b - j, side)
+            bn = t - scale * _horner_point(second, at_a - i, at_b - j, side)
+            moved = abs(an - a) + abs(bn - b)
+            if math.isnan(moved):
+                return math.nan, math.nan
+            a, b = an, bn
+            if not moved > rest:
+                break
+        return a, b
+
     def _locate(self, s: np.ndarray, t: np.ndarray) -> tuple[tuple, tuple]:
         """Return cell indices and coordinates inside the cell, 0..1; NaN stays NaN."""
         nx, ny = self.shape

@@ -69,6 +69,7 @@ class Circle:
             self._series = np.append(of[:1], of[1::2] - 1j * of[2::2])  # Re of powers of e^(it)
         cubic &= self._count > 0 and not harmonics
         self._pieces = cubic_pieces(values, periodic=True) if cubic else None
+        self._piece_points = None if self._pieces is None else self._pieces.T.tolist()
 
     def at(self, angle_rad: np.ndarray) -> np.ndarray:
         """Return the values at `angle_rad`, any shape; NaN next to unknown lines."""
@@ -96,11 +97,14 @@ class Circle:
 
     def at_point(self, angle_rad: float) -> float:
         """Return `at` of one finite angle."""
-        if self._pieces is not None or self._series is not None or self._holes:
+        if self._series is not None or self._holes:
             return float(self.at(np.asarray(angle_rad)))
         s = angle_rad * (self._count / (2 * np.pi))
         below = math.floor(s)
         u, i = s - below, below % self._count
+        if self._piece_points is not None:
+            c0, c1, c2, c3 = self._piece_points[i]
+            return ((c3 * u + c2) * u + c1) * u + c0
         low, high = self._points[i], self._points[i + 1]
         return low if u == 0 else low + u * (high - low)
 

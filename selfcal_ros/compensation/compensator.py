@@ -162,11 +162,15 @@ class Compensator:
             As `correct`.
         """
         (hx, hy), pitch = self.error_map.artifact.half, self._pitch
-        a, b = self._cells.solve_point(x_m / pitch + hx, y_m / pitch + hy, 1 / pitch)
+        s, t = x_m / pitch + hx, y_m / pitch + hy
+        a, b = self._cells.solve_point(s, t, 1 / pitch)
         if math.isnan(a):  # the solution is in another cell, outside, or does not exist
-            x, y = self.correct(x_m, y_m)
-            return float(x), float(y)
-        return (a - hx) * pitch, (b - hy) * pitch
+            a, b = self._cells.solve_point_anywhere(s, t, 1 / pitch)
+        x, y, snap = (a - hx) * pitch, (b - hy) * pitch, SNAP * pitch
+        is_inside = abs(x) <= hx * pitch + snap and abs(y) <= hy * pitch + snap
+        if math.isnan(a) or (self.outside == "refuse" and not is_inside):
+            x, y = map(float, self.correct(x_m, y_m))
+        return x, y
 
     def uncertainty(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
