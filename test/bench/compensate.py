@@ -6,6 +6,10 @@ process of its own, has another processor. The age of a corrected sample is the 
 publishing of the sample to its arrival. The rival has the executor, the queue and the interpolator
 that come first to mind: SingleThreadedExecutor, 5000 samples, RegularGridInterpolator.
 
+The rows of strangers are measured as somebody else would: a publisher that sleeps between its
+messages and a listener that spins, both written by hand, share all processors with the node; the
+stage wanders over the nodes of the map and beyond its edge.
+
     python test/bench/compensate.py [--rates 500,1000,2000,10000] [--seconds 10]
 """
 
@@ -33,6 +37,12 @@ PITCH_M, SIZE, LINES = 0.01, 21, 72
 SITE, THETA = (3, 15), 0.4
 STAMP = struct.Struct("<iI")
 STAMP_AT = 4
+STRANGER_RATE = 2000
+STRANGERS = "selfcal, by strangers"
+QUEUE = 100
+"""Samples that the listener of strangers lets wait."""
+WANDER_S = 2.0
+"""Period of the stage of strangers, which goes a tenth beyond the edge of the field."""
 SETTLING_S, PATIENCE_S = 2.5, 60.0
 """Longer than from one status of the node to the next; longest wait for the node."""
 
@@ -168,6 +178,86 @@ def play(rate: int, seconds: float, pid: int) -> dict:
     return row
 
 
+def strangers(rate: int, seconds: float) -> dict:
+    """Return the row of a publisher and a listener written by somebody else."""
+    from selfcal_ros.cli.processes import domain, process
+    from selfcal_ros.model.result import result_to_dict
+    from selfcal_ros.outputs import write_json
+    from test.support.maps import result_of
+
+    with domain() as environment, tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/map.json"
+        write_json(path, result_to_dict(result_of(error_map())))
+        module, *words = METHODS["selfcal"][1:]
+        with process(module, [word.format(map=path) for word in words],
+                     environment | {"PYTHONPATH": str(ROOT)}) as node:
+            command = [sys.executable, __file__, "--seconds", str(seconds), "--stranger"]
+            listener = subprocess.Popen([*command, "listen", str(rate)], env=environment,
+                                        stdout=subprocess.PIPE, text=True)
+            idle = cpu_s(node.pid)
+            subprocess.run([*command, "publish", str(rate)], env=environment, check=True)
+            used = cpu_s(node.pid) - idle
+            row = json.loads(listener.communicate()[0])
+            return {"benchmark": f"compensate {rate} Hz", "method": STRANGERS,
+                    "n": round(rate * seconds), "peak_mb": round(peak_mb(node.pid), 1),
+                    "max_error": None, "cpu_seconds": used,
+                    **row}
+
+
+def publish_as_stranger(rate: int, seconds: float) -> None:
+    """Publish samples of a stage that wanders, with a pause of sleep between them."""
+    import rclpy
+
+    from selfcal_ros.nodes import names
+
+    rclpy.init()
+    node = rclpy.create_node("stranger_who_publishes")
+    out = node.create_publisher(names.ENCODER.type, names.ENCODER.name, 10)
+    while not out.get_subscription_count():
+        time.sleep(0.05)
+    time.sleep(1.0)
+    reach, message = 1.1 * (SIZE // 2) * PITCH_M, names.ENCODER.type(name=["x", "y", "theta"])
+    began = time.monotonic()
+    for number in range(round(rate * seconds)):
+        time.sleep(max(began + number / rate - time.monotonic(), 0.0))
+        turn = 2 * np.pi * number / rate / WANDER_S
+        message.position = [reach * np.cos(turn), 0.0, turn]  # along a row of nodes
+        second, nanosecond = divmod(time.time_ns(), 10**9)
+        message.header.stamp.sec, message.header.stamp.nanosec = second, nanosecond
+        out.publish(message)
+    time.sleep(SETTLING_S)
+
+
+def listen_as_stranger(rate: int, seconds: float) -> None:
+    """Print what a listener sees of the corrected samples, as JSON."""
+    import rclpy
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    from selfcal_ros.nodes import names
+
+    rclpy.init()
+    node = rclpy.create_node("stranger_who_listens")
+    ages: list[float] = []
+    told: list = []
+
+    def take(message) -> None:
+        stamp = message.header.stamp
+        ages.append((time.time_ns() - stamp.sec * 10**9 - stamp.nanosec) * 1e-9)
+    node.create_subscription(names.CORRECTED.type, names.CORRECTED.name, take, QoSProfile(
+        depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT))
+    health = names.of_node("compensator", names.HEALTH)
+    node.create_subscription(health.type, health.name, told.append, health.qos)
+    while not ages:
+        rclpy.spin_once(node)
+    end = time.monotonic() + seconds + SETTLING_S - 0.5
+    while time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    skipped = {item.key: item.value for item in told[-1].values}["skipped"] if told else None
+    print(json.dumps({"seconds": float(np.median(ages)), "corrected": len(ages),
+                      "seconds_99": float(np.quantile(ages, 0.99)), "seconds_max": max(ages),
+                      "skipped": skipped}))
+
+
 def cpu_s(pid: int) -> float:
     """Return the CPU time of a process, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -182,7 +272,7 @@ def peak_mb(pid: int) -> float:
 
 
 def measured(method: str, rate: int, seconds: float) -> dict:
-    """Return the row of `drive` in a process of its own."""
+    """Return the row of `drive` or `strangers` in a process of its own."""
     done = subprocess.run([sys.executable, __file__, "--worker", method, str(rate), "--seconds",
                            str(seconds)], stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout)
@@ -202,18 +292,25 @@ def main() -> None:
     parser.add_argument("--rates", default=",".join(map(str, RATES)))
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rival", help=argparse.SUPPRESS)
+    parser.add_argument("--stranger", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--worker", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.rival:
         rival(args.rival)
+    elif args.stranger:
+        act = publish_as_stranger if args.stranger[0] == "publish" else listen_as_stranger
+        act(int(args.stranger[1]), args.seconds)
     elif args.worker:
-        print(json.dumps(drive(args.worker[0], int(args.worker[1]), args.seconds)))
+        method, rate = args.worker[0], int(args.worker[1])
+        print(json.dumps(strangers(rate, args.seconds) if method == STRANGERS
+                         else drive(method, rate, args.seconds)))
     else:
         print(f"{'':<20} {'method':<32} {'median ms':>10} {'99 % ms':>9} {'max ms':>9} "
               f"{'corrected':>15} {'skipped':>8} {'us of CPU':>10}")
         for rate in map(int, args.rates.split(",")):
             for method in METHODS:
                 show(measured(method, rate, args.seconds))
+        show(measured(STRANGERS, STRANGER_RATE, args.seconds))
 
 
 if __name__ == "__main__":

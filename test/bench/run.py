@@ -189,14 +189,14 @@ def measure_ingest(benchmark: str, number: int):
 
 def measure_compensation(seconds: float):
     """Yield a row for each compensator at each rate."""
-    for rate in compensate.RATES:
-        for method in compensate.METHODS:
-            if find_spec("rclpy") is None:
-                yield {"benchmark": f"compensate {rate} Hz", "method": method,
-                       "n": round(rate * seconds), "seconds": None, "peak_mb": None,
-                       "max_error": None, "note": "not installed"}
-            else:
-                yield compensate.measured(method, rate, seconds)
+    rows = [(rate, method) for rate in compensate.RATES for method in compensate.METHODS]
+    for rate, method in [*rows, (compensate.STRANGER_RATE, compensate.STRANGERS)]:
+        if find_spec("rclpy") is None:
+            yield {"benchmark": f"compensate {rate} Hz", "method": method,
+                   "n": round(rate * seconds), "seconds": None, "peak_mb": None,
+                   "max_error": None, "note": "not installed"}
+        else:
+            yield compensate.measured(method, rate, seconds)
 
 
 def show(row: dict) -> None:

@@ -103,7 +103,9 @@ def test_without_ros_compensators_are_left_out_with_a_reason(bench, monkeypatch)
     monkeypatch.setattr(sys.modules["run"], "find_spec", lambda name: None)
     _, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--compensate", "2")
     assert [(row["benchmark"], row["n"], row["note"]) for row in rows[::2]] == [
-        (f"compensate {rate} Hz", 2 * rate, "not installed") for rate in (500, 1000, 2000, 10000)]
+        (f"compensate {rate} Hz", 2 * rate, "not installed")
+        for rate in (500, 1000, 2000, 10000, 2000)]
+    assert rows[-1]["method"] == "selfcal, by strangers"
     assert all(row.keys() >= KEYS for row in rows)
 
 
