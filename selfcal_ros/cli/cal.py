@@ -5,6 +5,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from selfcal_ros.aerotech import export
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
-from selfcal_ros.aerotech.read import load_cal, read_cal, refuse_errors
+from selfcal_ros.aerotech.read import load_cal, parse_cal, read_cal, refuse_errors
 from selfcal_ros.aerotech.rules import Gi4
 from selfcal_ros.aerotech.verify import (
     controller_figure,
@@ -25,9 +26,10 @@ from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
-from selfcal_ros.compensation.export import fill_unknown, provenance
+from selfcal_ros.compensation.export import fill_unknown, provenance, require_plausible
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
+from selfcal_ros.controllers.export import place_to_look
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain
@@ -36,6 +38,12 @@ from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
 
 SCANNER_BITS = 16
 LEAST_BEND_M = 1e-9
+STEPS = (
+    "Studio, workspace Configure, Controller, Calibration: name the file; or load it without a "
+    "reset by CalibrationLoad()",
+    "home the axes: they are corrected only once they are homed",
+    "see it act: the data signal Position Calibration All of each axis shows its correction")
+"""How a file is put into use (Automation1, Axis Calibration)."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -213,15 +221,24 @@ def _export(args: argparse.Namespace) -> int:
         texts[beside] = cal_text([table], comments=comments,
                                  decimals=export.theta_decimals(result.error_map))
     lines, files = [], []
+    tables = parse_cal(texts[args.output].encode(), args.output).tables
+    loaded = plane_correction(CalEvaluator(tables, setup_of(frame)), frame)
+    steps = (*STEPS, place_to_look(frame, loaded, error_map))
     for path, backup in replace_files(args, texts, [args.result, args.onto]).items():
         kind = "1D table for theta" if path != args.output else "2D table for x and y"
         lines.append(f"{path}: {kind}{replaced(backup)}")
         files.append({"file": path, "kind": kind, "old_file": backup})
-    say(args, "\n".join(lines), {"files": files, "filled": filled})
+    say(args, "\n".join([*lines, *numbered(steps)]),
+        {"files": files, "filled": filled, "checklist": list(steps)})
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
         print("selfcal cal: the theta table covers one turn either way and does not roll over;"
               f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
     return exit_code(result)
+
+
+def numbered(steps: Sequence[str]) -> list[str]:
+    """Return the lines of a checklist."""
+    return ["to put it into use:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1))]
 
 
 def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
@@ -231,12 +248,16 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     ------
     NotIdentifiableError
         If the measured plan does not identify the stage.
+    InputError
+        As `require_plausible`, unless the map was accepted as steep.
     """
     result, filled = read_result(args.result), 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
                                    "measure the missing views",
                                    result.observability)
+    if not args.steep:
+        require_plausible(result.error_map, args.result)
     if args.fill:
         error_map, filled = fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)

@@ -22,7 +22,7 @@ from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
-from selfcal_ros.compensation.export import origin_lines, verdict_lines
+from selfcal_ros.compensation.export import origin_lines, require_plausible, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_text
@@ -103,6 +103,9 @@ def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = T
     group.add_argument("--unit", choices=units, default="mm" if default and "in" not in units else
                        None, help="unit of the linear axes (default mm"
                        + (", kmotion in)" if {"m", "in"} <= set(units) else ")"))
+    if default:
+        group.add_argument("--steep", action="store_true", help="accept a map that changes by more "
+                           "than 1 %% of the distance between neighbouring nodes")
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
             continue
@@ -207,6 +210,8 @@ def _orthogonality(args: argparse.Namespace) -> int:
             raise InputError("arguments", "RESULT.json and a measured square exclude each other",
                              "give one of them; --home-x and --home-y place the home position")
         result = read_result(args.source)
+        if not args.steep:
+            require_plausible(result.error_map, args.source)
         line = cal_lines.map_orthogonality(result.error_map, args.along)
         return _deliver(args, line, frame, (args.along, other), result)
     if None in measured:
@@ -250,6 +255,8 @@ def _line(args: argparse.Namespace) -> int:
         line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
     else:
         result = read_result(args.source)
+        if not args.steep:
+            require_plausible(result.error_map, args.source)
         line = cal_lines.map_line(result.error_map, args.along, corrected)
     if corrected != args.along:
         line = cal_lines.without_slope(line)

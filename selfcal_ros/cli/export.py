@@ -2,8 +2,9 @@
 """``selfcal export``: the map of a result as the table of a controller."""
 
 import argparse
+import sys
 
-from selfcal_ros.cli.cal import figures_of, ready, residual_text, say_bent
+from selfcal_ros.cli.cal import figures_of, numbered, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say
@@ -47,13 +48,18 @@ def run(args: argparse.Namespace) -> int:
     exported = export(args.format, result, wiring, args.output, active=active, filled=filled,
                   command=command(args))
     say_bent(args, exported.bent_m)
+    if exported.remains:
+        print(f"selfcal export: {args.format} cannot hold the whole map: {exported.remains}",
+              file=sys.stderr)
     backups = replace_files(args, exported.files, [args.result, *(args.onto or ())])
     lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:
         lines.append(residual_text(exported.residuals))
+    lines += numbered(exported.checklist)
     say(args, "\n".join(lines), {
         "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
-        "filled": filled, "residuals": figures_of(exported.residuals)})
+        "filled": filled, "residuals": figures_of(exported.residuals),
+        "checklist": list(exported.checklist)})
     return exit_code(result)
 
 

@@ -45,7 +45,9 @@ def _means(error_map: ErrorMap, wiring: Wiring) -> tuple[tuple, list[tuple]]:
 def write_linuxcnc(error_map: ErrorMap, wiring: Wiring) -> Texts:
     """Return a COMP_FILE for each joint, type 0: nominal, forward, reverse.
 
-    The controller adds nominal - forward, so forward = nominal - c.
+    The controller adds nominal - forward, so forward = nominal - c. The correction at its zero is
+    subtracted, which shifts all positions by a constant, no part of a calibration: a jump of c
+    after homing would lie in the dead band of the controller's ramp and never be applied.
     """
     (x, y), [(cx, *_), (_, cy, _)] = _means(error_map, wiring)
     files, unit_m = {}, wiring.frame.unit_m
@@ -53,6 +55,7 @@ def write_linuxcnc(error_map: ErrorMap, wiring: Wiring) -> Texts:
         at = positions
         if len(at) > MAX_LINES:
             at = np.linspace(positions[0], positions[-1], MAX_LINES)
+        values = values - np.interp(0.0, at, np.interp(at, positions, values))
         files[name] = [" ".join((fixed(p, unit_m), *[fixed(p - c, unit_m)] * 2))
                        for p, c in zip(at, np.interp(at, positions, values), strict=True)]
     return files

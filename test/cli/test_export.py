@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
@@ -37,7 +38,9 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     assert run(line) == 0
     out = capsys.readouterr().out.splitlines()
     assert out[:len(files)] == files and all(Path(file).is_file() for file in files)
-    assert out[len(files)].startswith("residual true - commanded") and len(out) == len(files) + 7
+    assert out[len(files)].startswith("residual true - commanded")
+    assert out[len(files) + 7] == "to put it into use:" and all(
+        line.startswith(f"  {number}. ") for number, line in enumerate(out[len(files) + 8:], 1))
     before, after = map(float, out[len(files) + 1].split()[-2:])
     assert before > 0.1 and after < (0.0001 if (len(files) == 1 and name != "siemens")
                                      or name == "beckhoff" else 0.99 * before)
@@ -48,6 +51,67 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     assert [entry["file"] for entry in found["files"]] == files
     assert all(Path(entry["old_file"]).is_file() for entry in found["files"])
     assert found["residuals"]["sites"]["after"]["rms"] == pytest.approx(1e-6 * after, abs=1e-12)
+
+
+@pytest.mark.parametrize("line", ["export kmotion R.json -o t.txt", "cal export R.json -o t.cal",
+                                  "cal straightness R.json -o s.cal"])
+def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, line):
+    """One node of 150 um, the others of a few: 1 % of the pitch is 100 um."""
+    gx = MAP.gx.copy()
+    gx[3, 1] += 150e-6
+    write_json("R.json", result_to_dict(result_of(replace(MAP, gx=gx))))
+    assert main(line.split()) == 2
+    err = capsys.readouterr().err
+    assert re.search(r": R.json: gx changes by 1[45]\d(\.\d)? um from the node at \((0|10), -10\) "
+                     r"mm to the next along x, 10 mm away: is it real\?; check the readings there; "
+                     r"if it is, add --steep\n$", err)
+    assert not list(Path().glob("?.*t*"))
+    assert main([*line.split(), "--steep"]) == 0
+    gx[3, 1] -= 60e-6
+    write_json("R.json", result_to_dict(result_of(replace(MAP, gx=gx))))
+    assert main([*line.split(), "--force"]) == 0
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("kmotion", ("Tool Setup, Trajectory Planner: enter t.txt",)),
+    ("pmac", ("send t.txt to the controller, then I51=1", "Mxx69 of motors 3 and 4")),
+    ("beckhoff", ("t_x.txt and t_y.txt to the compensation lists of axes 3 and 4",
+                  "lr_param.crosscomp2 1")),
+    ("linuxcnc", ("[JOINT_2] write COMP_FILE = t_x.txt and COMP_FILE_TYPE = 0, under [JOINT_3] "
+                  "COMP_FILE = t_y.txt", "halcmd getp joint.2.backlash-corr")),
+    ("siemens", ("MD32710 $MA_CEC_ENABLE of axes AX3 and AX4",))])
+def test_the_checklist_names_files_axes_and_the_place_to_look_at(capsys, name, said):
+    """The place is that of the largest correction, relative to the controller's zero."""
+    line = f"{name} R.json -o t.txt --json --unit mm --x-axis 3 --y-axis 4 --home-x 10 "
+    counts = "--counts-per-unit 3=2000000 --counts-per-unit 4=2000000"
+    assert run(line + counts * (name == "pmac")) == 0
+    *steps, look = json.loads(capsys.readouterr().out)["checklist"]
+    assert all(any(part in step for step in steps) for part in said)
+    found = re.match(r"the correction is largest at x = (\S+) mm, y = (\S+) mm: relative to zero "
+                     r"the axes go (\S+) um and (\S+) um further there; measure it", look)
+    x, y, cx, cy = map(float, found.groups())
+    if name in ("linuxcnc", "siemens"):
+        return  # they hold a part of the map
+    c = 1e6 * (np.stack([MAP.gx, MAP.gy]) - np.stack([MAP.gx, MAP.gy])[:, 3, 2][:, None, None])
+    i, j = np.unravel_index(np.hypot(*c).argmax(), MAP.gx.shape)
+    assert (x, y) == (10 * (i - 2) - 10, 10 * (j - 2))
+    assert (cx, cy) == pytest.approx(c[:, i, j], abs=1e-3)
+
+
+def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
+    """Its table holds one axis at a time, and is zero at the controller's zero: c = 0 there."""
+    assert run("linuxcnc R.json -o t.txt --home-x 5 --verify") == 0
+    out, err = capsys.readouterr()
+    before, after = map(float, out.splitlines()[3].split()[-2:])
+    assert "cannot hold the whole map: left at the nodes on a simulated controller: " \
+           f"{after:.3g} um rms" in err and f"of {before:.3g} um rms" in err
+    rows = [list(map(float, row.split())) for row in Path("t_x.txt").read_text().splitlines()[:5]]
+    at, forward, _ = np.array(rows).T
+    means = 1e3 * MAP.gx.mean(axis=1)
+    at_zero = (means[2] + means[3]) / 2  # the zero is at x = 5 mm, between two columns
+    np.testing.assert_allclose(at, [-25, -15, -5, 5, 15])
+    np.testing.assert_allclose(at - forward, means - at_zero, atol=2e-8)
+    assert np.interp(0.0, at, at - forward) == pytest.approx(0.0, abs=2e-8)
 
 
 def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
@@ -98,8 +162,8 @@ def test_holes_are_filled_on_request_and_the_file_says_so(capsys):
     assert run("siemens R.json -o t.txt") == 2
     assert "1 sites are unknown" in capsys.readouterr().err
     assert run("siemens R.json -o t.txt --fill") == 0
-    assert capsys.readouterr().err == "selfcal export: 1 unknown sites filled from their " \
-        "neighbours\n"
+    assert capsys.readouterr().err.startswith("selfcal export: 1 unknown sites filled from their "
+                                              "neighbours\n")
     assert "1 sites were not measured" in Path("t.txt").read_text()
 
 
