@@ -97,9 +97,13 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
                         ("encoder", ENCODER_TOPIC)):
         if not received[kind]:
-            raise NoDataError(str(path), f"no message on {topic}{tail}",
-                              f"{topics_like(topic, reader.topics)}record this topic too, see "
-                              "the README")
+            remedy = f"{topics_like(topic, reader.topics)}record this topic too, see the README"
+            if kind == "detection" and any(
+                    name.endswith(("/Image", "/CompressedImage"))
+                    for name in reader.topics.values()):
+                remedy = (f"it has images: find the marks in them with `selfcal detect {path} -o "
+                          "MARKS`, then solve MARKS")
+            raise NoDataError(str(path), f"no message on {topic}{tail}", remedy)
     if collector.timeline.artifact is None:
         raise NoDataError(str(path), "no MEASURE command" + (
             f" that can be used{tail}" if collector.unusable.get(Reason.COMMAND_BAD) else ""),

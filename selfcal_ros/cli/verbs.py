@@ -115,7 +115,7 @@ def verbs_of_others() -> dict[str, "EntryPoint"]:
     from importlib.metadata import entry_points  # slow, and seldom needed
 
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)
-            if point.name not in VERBS}
+            if point.name not in VERBS and not point.value.startswith("selfcal_ros.")}
 
 
 def summary_of(point: "EntryPoint") -> str:

@@ -23,6 +23,8 @@ from selfcal_ros.units import MM_PER_M
 
 MAX_VIEWS = 1000
 """Largest number of views of a plan."""
+ROUNDED = 1e-3
+"""Relative difference up to which a number is one of rad that was rounded, as 1.57."""
 
 
 def plan_from_dict(data: object, where: str) -> Plan:
@@ -122,6 +124,7 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
     if raw["angular"] and not artifact.angular_count:
         raise InputError(where, "angular marks are wanted but the plate has none",
                          "set angular to false")
+    _check_degrees(raw["rotation_deg"], where)
     turn = math.radians(raw["rotation_deg"])
     if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines
         raw["angular"] = artifact.angular_count > 0 and (
@@ -130,6 +133,14 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
     return View(raw["name"], turn, (a, b), raw["grid"], raw["angular"], raw["repeats"],
                 _order(raw["visit_order"], where))
+
+
+def _check_degrees(rotation_deg: float, where: str) -> None:
+    """Raise InputError for a rotation that is a whole number of quarter turns in rad."""
+    quarters = rotation_deg / (math.pi / 2) if math.isfinite(rotation_deg) else 0.0
+    if 1 <= abs(round(quarters)) <= 4 and math.isclose(quarters, round(quarters), rel_tol=ROUNDED):
+        raise InputError(f"{where}: rotation_deg", f"{rotation_deg:g} degrees: is it in rad?",
+                         f"give {90 * round(quarters)} for {round(quarters)} quarter turns")
 
 
 def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
