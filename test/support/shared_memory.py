@@ -16,11 +16,16 @@ OLD_S = 60.0
 
 
 def remove_stale(folder: Path, before_s: float) -> None:
-    """Remove segments made before an instant whose lock nobody holds."""
+    """Remove segments made before an instant whose lock nobody holds.
+
+    A younger lock is not even tried: its owner, who takes it now, would find it taken.
+    """
     for lock in folder.glob("fastrtps_*_el"):
-        with contextlib.suppress(OSError), lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            segment = lock.name.removesuffix("_el")
-            if lock.stat().st_mtime < before_s:
+        with contextlib.suppress(OSError):
+            if lock.stat().st_mtime >= before_s:
+                continue
+            with lock.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                segment = lock.name.removesuffix("_el")
                 for name in (segment, f"sem.{segment}_mutex", lock.name):
                     (folder / name).unlink(missing_ok=True)
