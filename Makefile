@@ -43,8 +43,8 @@ test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd build/ma
 quick: setup  ## two minutes: the tests that reach most of the code
 	@$(BIN)/python -m pytest -q -n 2 -m "not ros" $(QUICK)
 test-313:  ## the quick tests with Python 3.13, where it is there
-	@python=$$(command -v python3.13 || ls $$HOME/.pyenv/versions/3.13.*/bin/python 2>/dev/null | tail -n 1); \
-		$$python -c '' 2>/dev/null || { echo "test-313: left out: no Python 3.13"; exit 0; }; \
+	@for python in python3.13 $$HOME/.pyenv/versions/3.13.*/bin/python none; do $$python -c '' 2>/dev/null && break; done; \
+		test $$python != none || { echo "test-313: left out: no Python 3.13"; exit 0; }; \
 		VENV=.venv-313 PYTHON=$$python tools/setup.sh && .venv-313/bin/python -m pytest -q -n 2 -m "not ros" $(QUICK)
 mistakes: setup  ## what newcomers type wrong, and whether one line helps
 	@$(BIN)/python tools/mistakes.py
