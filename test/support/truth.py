@@ -74,10 +74,9 @@ def _of_cell(exposures: cell.GridExposures, artifact: Artifact,
     seen = next((one for one in exposures.others if one.cell == sub_view.cell), None) or cell.Seen(
         (0, 0), exposures.offset, np.stack([visits.m, visits.n]), exposures.there)
     m, n = seen.mark
-    site = np.stack(sub_view.on_stage(artifact).site_of(m, n)) * artifact.grid_pitch_m
     place = np.array([[sub_view.cell_m.real], [sub_view.cell_m.imag]])
     return replace(exposures, visits=replace(visits, m=m, n=n), offset=seen.offset - place,
-                   mark=seen.mark, there=seen.there, site=site, others=())
+                   mark=seen.mark, there=seen.there, others=())
 
 
 def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
