@@ -3,19 +3,19 @@
 """Record what the package computes, or compare it with a record of another tree.
 
     tools/same.py [--sessions N] [--only TEXT] RECORD.json.gz
-    tools/same.py --against RECORD.json.gz [--only TEXT]
+    tools/same.py --against RECORD.json.gz [--only TEXT] [--within PART]
 
 Solves every recorded bag by several models, and N (200) random simulated sessions: plans, sizes,
 effects, noises, faults and options drawn from the number of the session. Every number of each
-RESULT.json is recorded to the bit, and the names in it (grade, causes, views). Sentences are left
-out. A comparison ends with exit code 1 where a value differs; values of one tree alone are counted
-only. To record another commit: run this file with PYTHONPATH set to its work tree.
+RESULT.json is recorded, and the names in it (grade, causes, views). Sentences are left out. A
+comparison ends with exit code 1 where a value differs, in any bit or by more than PART of the
+standard uncertainty of the map (rms); values of one tree alone are counted only. To record another
+commit: run this file with PYTHONPATH set to its work tree.
 """
 
 import argparse
 import contextlib
 import gzip
-import hashlib
 import io
 import json
 import os
@@ -85,7 +85,7 @@ def leaves(node: object, path: str = "") -> Iterator[tuple[str, object]]:
             for place, item in enumerate(node):
                 yield from leaves(item, f"{path}/{place}")
         else:  # an array, row by row
-            yield path, hashlib.sha256(json.dumps(node).encode()).hexdigest()[:16]
+            yield path, node
     else:
         yield path, node
 
@@ -139,19 +139,39 @@ def record(names: list[str]) -> dict[str, dict[str, object]]:
     return done
 
 
-def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, object]]) -> int:
+def differ(old: object, new: object, allowed: float, part: float) -> bool:
+    """Return whether two values differ: numbers by more than `allowed` and a part of themselves."""
+    if isinstance(old, list) and isinstance(new, list):
+        return len(old) != len(new) or any(
+            differ(one, other, allowed, part) for one, other in zip(old, new, strict=True))
+    if allowed and isinstance(old, int | float) and isinstance(new, int | float):
+        return not abs(old - new) <= allowed + part * max(abs(old), abs(new))
+    return old != new
+
+
+def allowed_in(case: dict[str, object], part: float) -> float:
+    """Return a part of the standard uncertainty of a case's map, m."""
+    u = [value for path, row in case.items() if path.startswith("/error_map/u_gx") and part
+         for value in (row if isinstance(row, list) else []) if isinstance(value, float)]
+    return part * (sum(value**2 for value in u) / len(u)) ** 0.5 if u else 0.0
+
+
+def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, object]],
+            part: float = 0.0) -> int:
     """Print which values differ, and return how many cases have any."""
     different = 0
     alone: Counter[str] = Counter()
     for name in before.keys() & after.keys():
         old, new = before[name], after[name]
-        wrong = [path for path in old.keys() & new.keys() if old[path] != new[path]]
+        allowed = allowed_in(old, part)
+        wrong = [path for path in old.keys() & new.keys()
+                 if differ(old[path], new[path], allowed, 0.0 if "_map/" in path else part)]
         for path in old.keys() ^ new.keys():
             alone["/".join(part for part in path.split("/") if not part.isdigit())] += 1
         if wrong:
             different += 1
             print(f"{name}: {len(wrong)} values differ, first {sorted(wrong)[0]}: "
-                  f"{old[sorted(wrong)[0]]} -> {new[sorted(wrong)[0]]}")
+                  f"{str(old[sorted(wrong)[0]])[:80]} -> {str(new[sorted(wrong)[0]])[:80]}")
     for path, count in sorted(alone.items()):
         print(f"in one tree alone: {path} ({count} times)")
     print(f"{len(before.keys() & after.keys())} cases, {different} differ")
@@ -165,11 +185,13 @@ def main() -> int:
     parser.add_argument("--against", action="store_true", help="compare with RECORD.json.gz")
     parser.add_argument("--sessions", type=int, default=200, metavar="N")
     parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in their name")
+    parser.add_argument("--within", type=float, default=0.0, metavar="PART",
+                        help="numbers may differ by this part of u; default: by no bit")
     args = parser.parse_args()
     if args.against:
         before = json.loads(gzip.decompress(args.record.read_bytes()))
         names = [name for name in before if args.only in name]
-        return 1 if compare(before, record(names)) else 0
+        return 1 if compare(before, record(names), args.within) else 0
     bags = sorted(bag.name for bag in (ROOT / "bags").iterdir() if bag.is_dir())
     names = [" ".join(("bag", bag, *options)) for bag in bags for options in BAG_OPTIONS]
     names += [f"session {number}" for number in range(args.sessions)]

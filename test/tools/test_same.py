@@ -25,3 +25,13 @@ def test_a_case_differs_where_one_value_of_both_trees_does(after, differing, cap
 def test_a_session_is_drawn_from_its_number_alone():
     assert session(7) == session(7)
     assert session(7) != session(8)
+
+
+@pytest.mark.parametrize(("g", "p", "differing"), [
+    (1.00001e-7, 0.5, 0), (1.00009e-7, 0.5, 0), (1.0002e-7, 0.5, 1), (1e-7, 0.5004, 0),
+    (1e-7, 0.51, 1)])
+def test_a_map_may_differ_by_a_part_of_its_u_and_a_number_by_that_of_itself(g, p, differing):
+    before, after = ({"case": {"/error_map/u_gx": [[1e-8]], "/error_map/gx": [[one]], "/p": two}}
+                     for one, two in ((1e-7, 0.5), (g, p)))
+    assert compare(before, after, 1e-3) == differing
+    assert compare(before, after) == ((g, p) != (1e-7, 0.5))
