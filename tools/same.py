@@ -151,8 +151,9 @@ def differ(old: object, new: object, allowed: float, part: float) -> bool:
 
 def allowed_in(case: dict[str, object], part: float) -> float:
     """Return a part of the standard uncertainty of a case's map, m."""
-    u = [value for path, row in case.items() if path.startswith("/error_map/u_gx") and part
-         for value in (row if isinstance(row, list) else []) if isinstance(value, float)]
+    rows = case.get("/error_map/u_gx", [])
+    u = [value for row in (rows if part and isinstance(rows, list) else []) for value in row
+         if isinstance(value, float)]
     return part * (sum(value**2 for value in u) / len(u)) ** 0.5 if u else 0.0
 
 

@@ -180,10 +180,10 @@ def with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str,
         return terms
     fields = checked_fields(raw, where, {}, {
         "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
-    microscope = microscope_term(*(parse_size(f"{size:g}", where) for size in fields.values()))
-    if any(term.partition(":")[0] == microscope.name for term in terms):
+    declared = microscope_term(*(parse_size(f"{size:g}", where) for size in fields.values()))
+    if any(term.partition(":")[0] == declared.name for term in terms):
         raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
-    return tuple(map(str, parse_terms([*terms, str(microscope)], where)))
+    return tuple(map(str, parse_terms([*terms, str(declared)], where)))
 
 
 def terms_of(texts: list, where: str) -> tuple[str, ...]:

@@ -165,5 +165,5 @@ def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:
     """Return the terms assumed if neither options nor plan name them."""
     if [word.strip() for word in settings.model_terms] == [NO_TERMS]:
         return ()
-    microscope = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)
-    return tuple(microscope if term.name == microscope.name else term for term in default_terms())
+    declared = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)
+    return tuple(declared if term.name == declared.name else term for term in default_terms())

@@ -25,7 +25,7 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import ImageNoise
-from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, factors_of
+from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, OF_OFFSETS, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ErrorMap
@@ -90,7 +90,7 @@ class Together:
         of_stage = stage[:, :, sites].reshape(len(stage), here)
         maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
         maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
-        maps[:r, -4:] = self._kept("microscope", (4,)) / half_width_m(self.result)
+        maps[:r, -4:] = self._kept(OF_OFFSETS, (4,)) / half_width_m(self.result)
         return maps
 
     def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -35,6 +35,7 @@ from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
 from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
 from selfcal_ros.estimation.joint.solved import (
     MICROSCOPE_PARTS,
+    OF_OFFSETS,
     Solved,
     angular_terms,
     kept_residuals,
@@ -330,12 +331,12 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
         lines = np.stack([stage, of_plate]).transpose(2, 0, 1) * length
         if sense is Sense.PLATE_MOVES:
             lines[:, 0] = -lines[:, 0, -np.arange(lines.shape[2]) % lines.shape[2]]
-    microscope = -length * np.array([[
+    of_offsets = -length * np.array([[
         block_of(column.term).of_offsets and column.component == part
         for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)
     return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
                 len(plates), 2, *system.grid.views.plate_shape),
-            "lines": lines, "microscope": microscope}
+            "lines": lines, OF_OFFSETS: of_offsets}
 
 
 def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:

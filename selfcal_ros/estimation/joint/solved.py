@@ -145,6 +145,9 @@ map, the others leave the map as it is."""
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 """Coefficients of a microscope in their order."""
 
+OF_OFFSETS = "microscope"
+"""Key of what factors make of them."""
+
 NEGLIGIBLE = 1e-3
 """Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
 

@@ -263,16 +263,16 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
     terms, (mark, image) = stacked(values) * size, _two_noises(readings, plate, xy)
     white, images = np.tile(mark / readings.weight, 2), np.sqrt(image) * readings.of_images()
     noise = np.diag(white) + images @ images.T + terms @ terms.T
-    microscope, size = readings.of_microscope()
-    found = plate.microscope
+    matrix, size = readings.of_offsets()
+    found = plate.of_offsets
     if found is None or any(term.block.of_offsets for term in options.terms):
-        own, found = stacked(microscope) * size, np.zeros(4)
-        noise, microscope = noise + own @ own.T, 0 * microscope
+        own, found = stacked(matrix) * size, np.zeros(4)
+        noise, matrix = noise + own @ own.T, 0 * matrix
     marks, of_marks = readings.of_marks()
-    of_plate = np.hstack([of_marks, stacked(microscope)])
+    of_plate = np.hstack([of_marks, stacked(matrix)])
     nowhere = np.zeros(plate.kept.sites.shape, dtype=bool)
     whole = noise + of_plate @ plate.kept.cover(nowhere, marks) @ of_plate.T
-    seen = seen_field(readings, whole, plate.field[readings.at[1:]], microscope @ found)
+    seen = seen_field(readings, whole, plate.field[readings.at[1:]], matrix @ found)
     n, field, known = seen.known.size, seen.field, seen.known
     rows = seen.gain.rows[:2 * n].reshape(2, *known.shape, -1)
     if readings.measurements.sense is Sense.PLATE_MOVES:  # G(X) = -H(-X)

@@ -158,7 +158,7 @@ class PlateReadings:
         view, row, column = self.at
         return self.columns.grid[mine][:, view, row, column].T, self.columns.size[mine]
 
-    def of_microscope(self) -> tuple[np.ndarray, np.ndarray]:
+    def of_offsets(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the readings for a unit of each of its coefficients, (r, 4), and their sizes."""
         out, size = np.zeros((len(self.at[0]), 4), dtype=complex), np.zeros(4)
         for i, column in enumerate(self.columns.columns):
@@ -230,7 +230,7 @@ class Seen:
 
 
 def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
-               microscope: np.ndarray) -> Seen:
+               of_offsets: np.ndarray) -> Seen:
     """Return the map of the stage for a covariance of the readings.
 
     Parameters
@@ -241,7 +241,7 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
         Covariance of the readings less what is known, m^2.
     plate : complex array (r,)
         Known error of the plate, m.
-    microscope : complex array (r,)
+    of_offsets : complex array (r,)
         Known effect of the microscope, m.
 
     Raises
@@ -271,7 +271,7 @@ def seen_field(readings: PlateReadings, noise: np.ndarray, plate: np.ndarray,
         held[2 * z.size:, 3:] = grid.differences
         gain = _in_datum(design, noise, held, columns, VAGUE * placed)
         if strict == 2:
-            return _converged(readings, design, gain, known, known_parts=(plate, microscope))
+            return _converged(readings, design, gain, known, known_parts=(plate, of_offsets))
         u2 = (gain.rows ** 2 @ spread + gain.free / unit)[:2 * z.size].reshape(2, *z.shape)
         u2, best = u2.max(axis=0), u2.max(axis=0)[touched].min()
         strict += int(best < KNOWN**2)
@@ -296,10 +296,10 @@ def _in_datum(design: np.ndarray, noise: np.ndarray, held: np.ndarray, columns: 
 def _converged(readings: PlateReadings, design: np.ndarray, gain: Gain, known: np.ndarray, *,
                known_parts: tuple[np.ndarray, np.ndarray]) -> Seen:
     """Return the solution with finite rotations, at the places of the stage (Gauss-Newton)."""
-    problem, at, (plate, microscope) = readings.problem, readings.at, known_parts
+    problem, at, (plate, of_offsets) = readings.problem, readings.at, known_parts
     n, marks = known.size, problem.system.grid.views.z[at[1:]] * problem.half_width_m
     places = problem.places if problem.moves else None
-    y, moved = problem.grid.y[at] - plate - microscope, None
+    y, moved = problem.grid.y[at] - plate - of_offsets, None
     taken = np.zeros(len(y), dtype=complex)
     for _ in range(MOST_STEPS):
         right = stacked(y - taken)
