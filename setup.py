@@ -42,6 +42,7 @@ setup(
                     "dask": ["distributed>=2024.1"],
                     "gcode": ["pyserial>=3.5"],  # BSD
                     "camera": ["opencv-python-headless>=4.8"],  # Apache-2.0
+                    "ophyd": ["ophyd>=1.9"],  # BSD
                     "micromanager": ["pymmcore>=11.1"],  # LGPL: loaded, never shipped
                     "pdf": ["weasyprint>=62"]},
     python_requires=">=3.12",

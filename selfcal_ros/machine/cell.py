@@ -25,6 +25,7 @@ ENTRY_POINTS = "selfcal.machines"
 SHIPPED = {
     "simulated": "selfcal_ros.machine.simulated:SimulatedMachine",
     "gcode": "selfcal_ros.machine.gcode:GcodeMachine",
+    "ophyd": "selfcal_ros.machine.ophyd:OphydMachine",
     "micromanager": "selfcal_ros.machine.micromanager:MicroManagerMachine",
 }
 """Machines of this package; further ones are entry points of the group ``selfcal.machines``."""

@@ -24,6 +24,7 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, said
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
@@ -31,7 +32,7 @@ from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
 from selfcal_ros.machine.visiting import Visitor, stops
 from selfcal_ros.messages import from_model
-from selfcal_ros.model.readings import placing_digest
+from selfcal_ros.model.readings import Measurements, placing_digest
 from selfcal_ros.model.view import Plan
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
@@ -290,7 +291,27 @@ class Run:
         self.desk.show(progress)
         measurements, _ = self.collector.collect()
         check_wiring(measurements)
+        if self._is_misplaced(measurements, view.name):
+            self._write_all(self._sequencer.redo())
+            return
         self._write_all(self._sequencer.status(self.plan.plan_id, index, True))
+
+    def _is_misplaced(self, measurements: Measurements, view: str) -> bool:
+        """Return whether the plate lies otherwise than this view asks; a robot's error is raised.
+
+        Raises
+        ------
+        PlacingError
+            If a robot placed it.
+        """
+        found = misplaced(measurements)
+        if not isinstance(found, Misplaced) or found.view != view:
+            return False
+        error = said(found)
+        if self.cell.placing == "robot":
+            raise error
+        self.desk.say(f"{error}; the view is measured anew")
+        return True
 
     def _check_first(self, grid: bool) -> None:
         """Go to the first mark of the view and make the small first move there."""

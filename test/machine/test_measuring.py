@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plan measured without ROS: the map, the bag, faults, and what is left after them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -220,3 +222,27 @@ def test_a_clock_that_was_set_back_does_not_continue(tmp_path):
         run_of(tmp_path, Spoilt(machine, "lost connection", after=12), cell).measure()
     with pytest.raises(InputError, match="clock is behind the last message"):
         run_of(tmp_path, machine, cell, Jumping()).measure(resume=True)
+
+
+def test_a_plate_that_is_laid_otherwise_than_asked_is_noticed_and_laid_anew(tmp_path):
+    *head, turned, shifted = PLAN.replace("grid_size: 3", "grid_size: 5").splitlines()
+    plan = "\n".join([*head, shifted, turned])
+    cell, machine = write_cell(tmp_path, plan=plan, cell=CELL.replace("robot", "person"),
+                               simulation=f"{SIMULATION}cell: {{with_ids: false}}\n")
+
+    class Careless(Agreeing):
+        """Turns the plate of the last view the other way the first time."""
+
+        def place(self, command):
+            super().place(command)
+            view = command.placed()
+            if self.placed.count("rot90") == 1:
+                view = replace(view, rotation_rad=-view.rotation_rad)
+            machine._lay(replace(command, view=view))
+
+    desk = Careless()
+    run_of(tmp_path, machine, cell, desk=desk).measure()
+    assert desk.placed == ["identity", "shift", "rot90", "rot90"]
+    assert any("measured anew" in line for line in desk.lines)
+    away, _ = away_from(machine.truth, tmp_path / "bag")
+    assert np.abs(away).max() < 5e-8

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The machine ``ophyd``: motors and detectors of ophyd, as laboratories drive them (EPICS, ...)."""
+
+import importlib
+import math
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.errors import first_line
+from selfcal_ros.machine.interface import Image, MachineError, Offset
+from selfcal_ros.machine.video import grey
+from selfcal_ros.units import M_PER, RAD_PER
+
+
+class OphydMachine:
+    """Positioners for the axes, and a detector that shows images.
+
+    Parameters
+    ----------
+    x, y : str
+        Positioners, each as ``module:object``.
+    theta : str, optional
+        Positioner of the rotary axis.
+    unit : str, optional
+        Unit of x and y: m, mm, um or nm.
+    angle_unit : str, optional
+        Unit of theta: deg, rad, mrad, urad or arcsec.
+    detector : str, optional
+        Detector, ``module:object``: it is triggered for every image.
+    image : str, optional
+        What has the image below the detector: names joined by dots, of a signal or a property.
+    timeout : float, optional
+        Longest time of a move or an exposure, s.
+
+    Raises
+    ------
+    MachineError
+        If an object cannot be had or is not connected.
+    """
+
+    def __init__(self, x: str, y: str, theta: str = "", unit: str = "mm", angle_unit: str = "deg",
+                 detector: str = "", image: str = "image", timeout: float = 60.0) -> None:
+        if unit not in M_PER:
+            raise MachineError(f"the unit '{unit}' is unknown", "ophyd: unit",
+                               f"use {', '.join(M_PER)}")
+        if angle_unit not in RAD_PER:
+            raise MachineError(f"the unit '{angle_unit}' is unknown", "ophyd: angle_unit",
+                               f"use {', '.join(RAD_PER)}")
+        names = {"x": x, "y": y} | ({"theta": theta} if theta else {})
+        self.axes = tuple(names)
+        self._per_unit = {axis: RAD_PER[angle_unit] if axis == "theta" else M_PER[unit]
+                          for axis in names}
+        self._timeout_s, self._image = timeout, image
+        self._motors = {axis: _object(name, timeout) for axis, name in names.items()}
+        self._detector = _object(detector, timeout) if detector else None
+
+    def position(self) -> tuple[float, ...]:
+        """Return the positions that the motors read back, m and rad."""
+        values = []
+        for axis, motor in self._motors.items():
+            value = _called(f"position of {axis}", lambda at=motor: at.position)
+            if value is None or not math.isfinite(float(value)):
+                raise MachineError(f"its position is {value}", axis, "check its connection")
+            values.append(float(value) * self._per_unit[axis])
+        return tuple(values)
+
+    def move_to(self, position: tuple[float, ...]) -> None:
+        """Start all axes, and wait for all."""
+        try:
+            waiting = [(axis, _called(axis, self._motors[axis].set, value / self._per_unit[axis]))
+                       for axis, value in zip(self.axes, position, strict=True)]
+            for axis, status in waiting:
+                _called(axis, status.wait, timeout=self._timeout_s)
+        except MachineError:
+            self.stop()
+            raise
+
+    def image(self) -> Image | None:
+        """Trigger the detector and return its image; None without one."""
+        if self._detector is None:
+            return None
+        status = _called("trigger", self._detector.trigger)
+        _called("trigger", status.wait, timeout=self._timeout_s)
+        found = reduce(getattr, self._image.split("."), self._detector)
+        pixels = np.asarray(_called("image", found.get) if hasattr(found, "get") else found)
+        return Image(grey(pixels))
+
+    def offsets(self) -> list[Offset]:
+        """Return nothing: without a detector nothing is seen."""
+        return []
+
+    def stop(self) -> None:
+        """Stop all axes."""
+        for axis, motor in self._motors.items():
+            if hasattr(motor, "stop"):
+                _called(axis, motor.stop)
+
+    def close(self) -> None:
+        """Do nothing: the objects belong to their module."""
+
+
+def _object(name: str, timeout_s: float) -> Any:
+    """Return an object named ``module:object``, connected."""
+    module, _, path = name.partition(":")
+    try:
+        found = reduce(getattr, path.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise MachineError(f"'{name}' cannot be had ({first_line(error)})", "ophyd",
+                           "name module:object; the module may lie beside CELL.yaml") from error
+    if hasattr(found, "wait_for_connection"):
+        _called(name, found.wait_for_connection, timeout=timeout_s)
+    return found
+
+
+def _called(where: str, function: Any, *values: Any, **more: Any) -> Any:
+    """Call ophyd; its errors become those of a machine."""
+    try:
+        return function(*values, **more)
+    except MachineError:
+        raise
+    except Exception as error:  # ophyd raises many kinds: LimitError, WaitTimeoutError, ...
+        raise MachineError(f"{type(error).__name__}: {first_line(error)}", where,
+                           "check limits, connection and the alarm of the axis") from error
