@@ -8,7 +8,7 @@ QUICK := test/shipped/test_bags.py test/shipped/test_configs.py test/cli/test_mi
 	test/test_house.py test/test_portable.py
 
 .PHONY: help setup demo quick test test-313 test-oldest lint ament-lint mistakes bench soak chaos mutants reality \
-	pictures map3d reference sbom clean
+	pictures docs map3d reference sbom clean
 help:  ## this list
 	@awk -F ':.*  ## ' '/^[a-z0-9-]+:.*  ## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 setup:  ## the environment .venv, without ROS installed
@@ -71,6 +71,10 @@ reality: setup  ## coverage of U on machines unlike the model, minutes, e.g. mak
 	@$(BIN)/python -m tools.reality $(REALITY)
 pictures: setup  ## the pictures of README and docs
 	@$(BIN)/python tools/pictures.py
+docs: setup  ## the documentation as a site, build/site
+	@test -e build/mkdocs/.complete || { $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--upgrade --target build/mkdocs mkdocs-material==9.6.14 "mkdocs<2" && touch build/mkdocs/.complete; }
+	@PYTHONPATH=build/mkdocs $(BIN)/python -m mkdocs build --quiet
 map3d:  ## the script of the turning map in reports; needs npm
 	@cd tools/map3d && npm ci --silent && npm run --silent build
 reference: setup  ## docs/reference.md from the code

@@ -64,13 +64,17 @@ def test_versions_agree():
     assert found == {__version__}
 
 
-def test_readme_names_every_verb_and_every_page_of_the_documentation():
-    readme = (ROOT / "README.md").read_text()
+def test_the_index_names_every_verb_and_every_page_of_the_documentation():
+    index = (ROOT / "docs/index.md").read_text()
     for verb in VERBS:
-        assert f"selfcal {verb}" in readme
-    for page in (ROOT / "docs").glob("*.md"):
-        assert f"docs/{page.name}" in readme
-    for link in re.findall(r"\]\((docs/[\w.]+)\)", readme):
+        assert f"selfcal {verb}" in index
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")}
+    assert set(re.findall(r"\]\(([\w.]+\.md)\)", index)) == pages - {"index.md"}
+    assert set(re.findall(r"[\w]+\.md", (ROOT / "mkdocs.yml").read_text())) == pages
+
+
+def test_the_links_of_the_readme_lead_somewhere():
+    for link in re.findall(r"\]\(([\w./]+)\)", (ROOT / "README.md").read_text()):
         assert (ROOT / link).is_file(), link
 
 
