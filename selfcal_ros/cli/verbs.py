@@ -71,7 +71,7 @@ EXAMPLES = {
     "cell check": "selfcal cell check --plan config/plans/hu.yaml",
     "measure": "selfcal measure config/plans/small.yaml config/cells/simulated.yaml "
                "-o measured --yes",
-    "camera init": "selfcal camera init bags/camera -o nodes.yaml --mark-size 72e-6 "
+    "camera init": "selfcal camera init BAG -o nodes.yaml --mark-size 72e-6 "
                    "--mark-pixels 12",
     "detect": "selfcal detect bags/camera -o marks --pixel-size 6e-6 --mark disc "
               "--mark-size 72e-6 --turn 1.5",
@@ -93,7 +93,7 @@ EXAMPLES = {
     "cal accuracy": "selfcal cal accuracy RESULT.json -o accuracy.cal",
     "cal straightness": "selfcal cal straightness RESULT.json -o straightness.cal",
     "cal orthogonality": "selfcal cal orthogonality --measured 5um --over 200mm --travel 300mm "
-                         "-o square.cal",
+                         "--home middle -o square.cal",
     "gcode": "selfcal gcode part.nc RESULT.json -o corrected.nc --dialect linuxcnc",
     "certificate": "selfcal certificate RESULT.json config/certificates/details.yaml -o dcc.xml",
     "iso230": "selfcal iso230 RESULT.json",

@@ -16,10 +16,9 @@ def in_terminal(command: Sequence[str], *, columns: int = 80,
                 folder: Path | None = None, keys: bytes = b"") -> tuple[int, str]:
     """Run a command in a terminal; return its exit code and its output.
 
-    `keys` are pressed before it starts, and wait for it.
+    `keys` are pressed when it has drawn something for the first time.
     """
     here, there = pty.openpty()
-    os.write(here, keys)
     with subprocess.Popen(command, stdin=there, stdout=there, stderr=there, cwd=folder,
                           start_new_session=True,
                           env=os.environ | {"COLUMNS": str(columns), "TERM": "xterm"}) as process:
@@ -28,6 +27,9 @@ def in_terminal(command: Sequence[str], *, columns: int = 80,
         while True:
             try:
                 shown += os.read(here, 4096)
+                if keys:
+                    os.write(here, keys)
+                    keys = b""
             except OSError:  # the command has ended
                 break
     os.close(here)
