@@ -72,7 +72,7 @@ def cell(graph, tmp_path):
 
 def test_topics_services_and_actions_exist_with_their_types(cell):
     services = [plain(words[1:]) for words in lines("service")]
-    topics = [plain(words[1:])[0] for words in lines("topic")]
+    topics = [plain(words[1:])[-1] for words in lines("topic")]
     actions = [plain(words[1:]) for words in lines("action")]
     wanted_services = {(name, of) for name, of, *_ in services} | {
         (f"{name}/_action/send_goal", f"{of}_SendGoal") for name, of, *_ in actions}
