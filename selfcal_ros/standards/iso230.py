@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of ISO 230 from a map and the repeats behind it: parts 2 (axes), 4 (circles), 6.
 
-ISO 230 counts deviations as actual minus commanded position, x = -G. Uncertainties are the rms of
-draws from the covariance of the map and from the scatter of the repeats, about the figure itself.
+ISO 230 counts deviations as actual minus commanded position, x = -G. Uncertainties are the rms
+difference between a figure and those of draws of the deviations, reversals and scatters.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
@@ -17,6 +18,10 @@ from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 
 DRAWS = 2000
 """Draws behind the uncertainties: 1.6 % standard error."""
+LEVEL = 0.01
+"""Probability below which values differ by more than their noise."""
+SHARES = 400
+"""Steps of the share of noise in the variance of measured values."""
 CIRCLE_POINTS = 72
 """Points of a circle."""
 FEWEST = 3
@@ -238,8 +243,8 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
     rng = np.random.default_rng(0)
     size = (DRAWS, len(known))
-    turned = reversal + rng.standard_normal(size) * u_reversal * np.sqrt(
-        (s_up**2 + s_down**2) / 2)
+    u = u_reversal * np.sqrt(np.mean(s_up**2 + s_down**2) / 2)
+    turned = _true_values(reversal, u, rng)
     draws = bidirectional(
         -(drawn - shift + turned / 2), -(drawn - shift - turned / 2),
         s_up * np.sqrt(rng.chisquare(dof_up, size) / dof_up),
@@ -250,6 +255,35 @@ def axis_figures(stage: StageMap, axis: int, line: int,
         (int(dof_up.min()) + 1, int(dof_down.min()) + 1), left_out,
         {name: Figure(float(value), _rms_about(draws[name], float(value)))
          for name, value in found.items()})
+
+
+def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return draws of the true values at positions, (DRAWS, n), given measured ones with u.
+
+    The largest of measured values is larger than the largest true one. Values that differ by no
+    more than their noise (chi-square test, 1 %) are taken as equal, which makes the bias largest.
+    Otherwise the true ones are normal about their mean, with a variance t^2 that is drawn given
+    the measured ones; its prior makes the share u^2 / (u^2 + t^2) of noise uniform (Daniels, 1999).
+    """
+    n = len(values)
+    if not (u > 0).all():
+        return np.broadcast_to(values, (DRAWS, n))
+    equal = 1 / u**2
+    common = equal @ values / equal.sum()
+    if chdtrc(n - 1, equal @ (values - common)**2) > LEVEL:
+        drawn = common + rng.standard_normal((DRAWS, 1)) / np.sqrt(equal.sum())
+        return np.repeat(drawn, n, axis=1)
+    share = (np.arange(SHARES) + 0.5) / SHARES
+    variance = np.mean(u**2) * (1 / share - 1)[:, None] + u**2
+    weight = 1 / variance
+    mean = weight @ values / weight.sum(axis=1)
+    fit = 0.5 * (np.log(weight) - weight * (values - mean[:, None])**2).sum(axis=1)
+    fit -= 0.5 * np.log(weight.sum(axis=1))
+    chosen = rng.choice(SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum())
+    about = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
+    kept = 1 - u**2 * weight[chosen]
+    drawn = rng.standard_normal((DRAWS, n)) * u * np.sqrt(kept)
+    return about[:, None] + kept * (values - about[:, None]) + drawn
 
 
 def _positions(stage: StageMap, axis: int, line: int,

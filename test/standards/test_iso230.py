@@ -14,6 +14,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import plain, write_json
@@ -307,3 +308,36 @@ def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monk
     both = capsys.readouterr()
     assert "visit_order" in both.err and "only M is given" in both.err
     assert "without repeats" in both.out
+
+
+@pytest.mark.parametrize(("reversal_m", "spread_m"), [(0.0, 0.0), (1e-7, 0.0), (5e-8, 5e-8)])
+@pytest.mark.parametrize("unlike", [False, True])
+def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_m, unlike):
+    """150 machines with known reversal and scatter, five approaches from each side.
+
+    The largest of eleven reversals with noise is too large by more than the scatter of draws about
+    the measured ones.
+    """
+    plate, count = Artifact(11, 0.01), 5
+    rng, ratios = np.random.default_rng(8), {}
+    for _ in range(150):
+        truth = rng.normal(0, 5e-7, plate.shape)
+        reversal = rng.normal(reversal_m, spread_m, 11) if spread_m else np.full(11, reversal_m)
+        scatter = 8e-8 * (rng.uniform(0.5, 1.5, (2, 11)) if unlike else np.ones((2, 11)))
+        u = np.full(plate.shape, 3e-8)
+        emap = ErrorMap(plate, truth + rng.normal(0, u), 0 * truth, u, u, np.zeros(0), np.zeros(0))
+        repeats = {}
+        for i in range(11):
+            s = scatter[:, i] * np.sqrt(rng.chisquare(count - 1, 2) / (count - 1))
+            noise = np.hypot(*scatter[:, i]) / np.sqrt(count)
+            repeats[i - 5, 0] = Scatter(
+                reversal[i] + rng.normal(0, noise), np.sqrt(2 / count), *s, count - 1, count - 1,
+                0.0)
+        found = axis_figures(StageMap(result_of(emap)), 0, 0, repeats).figures
+        mean = -truth[:, 5]
+        true = bidirectional(mean - reversal / 2, mean + reversal / 2, *scatter)
+        for name, figure in found.items():
+            ratios.setdefault(name, []).append((figure.value - true[name]) / figure.u)
+    for name, least in (("B", 0.94), ("R", 0.94), ("A", 0.89), ("E", 0.89), ("M", 0.89)):
+        assert np.mean(np.abs(ratios[name]) < 2) > least, name
+    assert np.sqrt(np.mean(np.square(ratios["B"]))) < 1.4
