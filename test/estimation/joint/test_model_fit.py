@@ -109,3 +109,20 @@ def test_rotations_settle_in_four_steps_from_what_the_views_show(monkeypatch):
     monkeypatch.setattr(model_fit, "fit", lambda *args: fits.append(1) or plain(*args))
     fit_model(prepare(readings, BARE)[0])
     assert len(fits) == 1 + 4
+
+
+def test_without_noise_the_iteration_ends_at_rounding(monkeypatch):
+    """A strain that all views share is the plate's: no reading tells it, and rounding moves it."""
+    plan, rng = plan_of("0,90,tx", Artifact(21, 0.01)), np.random.default_rng(21)
+    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
+    steps, step = [], model_fit._State.step
+
+    def counted(state):
+        steps.append(step(state))
+        return steps[-1]
+
+    monkeypatch.setattr(model_fit._State, "step", counted)
+    problem, _ = prepare(readings, bare(terms=parse_terms(["plate_strain:7e-8"], "")))
+    found = fit_model(problem)
+    assert len(steps) < 10 and steps[-1] < 1e-15
+    assert np.abs(found.coefficients).max() < 1e-15
