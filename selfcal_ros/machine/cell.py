@@ -25,6 +25,7 @@ ENTRY_POINTS = "selfcal.machines"
 SHIPPED = {
     "simulated": "selfcal_ros.machine.simulated:SimulatedMachine",
     "gcode": "selfcal_ros.machine.gcode:GcodeMachine",
+    "joint_trajectory": "selfcal_ros.nodes.joint_trajectory:JointTrajectoryMachine",
     "ophyd": "selfcal_ros.machine.ophyd:OphydMachine",
     "micromanager": "selfcal_ros.machine.micromanager:MicroManagerMachine",
 }
