@@ -14,10 +14,13 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.estimator import plan_of, read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
+from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
+from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.results import read_result
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.rendering import Camera, Exposure, exposures
@@ -191,6 +194,7 @@ CAMERA: Section = (
     | _keys("ground", "contrast", "read_noise", "shot_noise", "vignetting")
     | {"distortion": Parameter("distortion", 0.0, "", "", -0.5, 0.5), "encoding": Parameter(
         "encoding", "mono8", "", choices=("mono8", "mono16"))})
+CORRECTION_TIMES = Parameter("times", 1.0, "of the table that act", low=-1000.0, high=1000.0)
 OF_IMAGES = ("lost", "duplicated")
 """Faults that images can have."""
 TOP = (
@@ -208,7 +212,7 @@ class Simulation:
 
     `noise_seed` is None if `seed` determines everything; `placed` has the actual poses in
     views that are not placed as the plan commands. With a `camera` there are images instead of grid
-    detections.
+    detections. With a `correction` the controller subtracts its map, `correction_times` it.
     """
 
     plan: Plan
@@ -221,6 +225,8 @@ class Simulation:
     noise_seed: int | None = None
     placed: tuple[View | None, ...] = ()
     camera: Camera | None = None
+    correction: ErrorMap | None = None
+    correction_times: float = 1.0
 
     def run(self) -> tuple[Truth, list[tuple[int, Event | Exposure]], dict[str, int]]:
         """Return the truth, the messages with their times of arrival, and the counts of faults."""
@@ -230,6 +236,8 @@ class Simulation:
         truth = random_truth(self.plan.artifact, len(self.plan.views), machine, self.spread,
                              placing=rng)
         truth = replace(truth, placed=self.placed)
+        if self.correction is not None:
+            truth = corrected(truth, self.correction, self.correction_times)
         settings = replace(self.settings, with_ids=True) if self.camera else self.settings
         made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
         events = list(exposures(truth, self.plan, self.camera, made, sense=settings.sense)
@@ -244,8 +252,7 @@ def read_simulation(path: str | Path) -> Simulation:
     Keys: ``plan`` (a path relative to the file, or an inline plan), ``seed``, ``noise_seed``,
     ``truth``, ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of
     `CellSettings`), ``faults`` (fields of `Faults`), ``camera`` (fields of `Camera`),
-    ``start_time`` (s), ``compression``; see
-    docs/simulate.md. SI units.
+    ``correction``, ``start_time`` (s), ``compression``; see docs/simulate.md. SI units.
 
     Raises
     ------
@@ -255,7 +262,7 @@ def read_simulation(path: str | Path) -> Simulation:
     """
     where = str(path)
     data = _mapping(read_yaml(path), where, (
-        "plan", "truth", "physics", "placed", "noise", "cell", "faults", "camera",
+        "plan", "truth", "physics", "placed", "noise", "cell", "faults", "camera", "correction",
         *(parameter.name for parameter in TOP)))
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
@@ -281,7 +288,8 @@ def read_simulation(path: str | Path) -> Simulation:
     return Simulation(plan, top["seed"], Spread(**read["truth"], **read["physics"]), settings,
                       faults, round(top["start_time"] * NS_PER_S), top["compression"],
                       top["noise_seed"] if "noise_seed" in data else None,
-                      _placed(data.get("placed", []), plan, f"{where}: placed"), camera)
+                      _placed(data.get("placed", []), plan, f"{where}: placed"), camera,
+                      *_correction(data.get("correction", {}), Path(path)))
 
 
 def camera_of(path: str | Path) -> tuple[Camera, Spread]:
@@ -346,6 +354,28 @@ def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
     for lie in filter(None, placed):
         lie.on_stage(plan.artifact)
     return tuple(placed)
+
+
+def _correction(data: Any, path: Path) -> tuple[ErrorMap | None, float]:
+    """Return the map that the controller subtracts, None without, and how many times."""
+    where = f"{path}: correction"
+    data = _mapping(data, where, ("result", "times"))
+    if not data:
+        return None, 1.0
+    if not isinstance(data.get("result"), str):
+        raise InputError(where, "the key 'result' is missing", "name a RESULT.json")
+    times = CORRECTION_TIMES.check(data.get("times", 1.0), where)
+    return read_result(path.parent / data["result"]).error_map, times
+
+
+def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
+    """Return a machine whose controller subtracts a table, bilinear between its nodes."""
+    controller, plate = Compensator(table), truth.artifact
+    g = truth.g - times * np.stack(controller.error(plate.x_m, plate.y_m))
+    if not controller.has_theta or not plate.angular_count:
+        return replace(truth, g=g)
+    return replace(truth, g=g, g_theta=truth.g_theta - times * controller.error_theta(
+        plate.theta_rad))
 
 
 def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:

@@ -12,6 +12,7 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.estimation.comparison.verification import Verification
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.figures import drawing as draw
@@ -90,6 +91,28 @@ def difference_picture(a: CalibrationResult, b: CalibrationResult,
     return _side_by_side(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
 
 
+def verification_picture(before: CalibrationResult, after: CalibrationResult,
+                         found: Verification, sentence: str) -> draw.Drawing:
+    """Return the maps without and with the correction side by side, at one scale.
+
+    Parameters
+    ----------
+    before, after : CalibrationResult
+        Maps on the same nodes.
+    found : Verification
+        What was found; the map after is drawn in the datum of the map before.
+    sentence : str
+        Heading.
+    """
+    with_it = replace(after, error_map=replace(after.error_map, gx=found.gx, gy=found.gy))
+    largest = max(float(np.nanmax(np.hypot(each.error_map.gx, each.error_map.gy)))
+                  for each in (before, with_it))
+    pictures = [error_map(each, title=title, largest_m=largest) for title, each in (
+        ("Without the correction", before), ("With the correction", with_it))]
+    return _side_by_side(pictures, sentence, f"without: {_origin(before)}",
+                         f"with: {_origin(after)}")
+
+
 def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
     """Return pictures side by side below a heading, with lines on their origin."""
     margin, top = 28.0, 30.0
@@ -117,17 +140,19 @@ def _origin(result: CalibrationResult) -> str:
 
 
 def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
-              title: str = "", of: str = "stage") -> draw.Drawing:
+              title: str = "", of: str = "stage", largest_m: float = 0.0) -> draw.Drawing:
     """Return the vectors of a map over their lengths in colour, with U around their heads.
 
-    A known truth is drawn beneath. `of` is a key of `ERRORS`.
+    A known truth is drawn beneath. `of` is a key of `ERRORS`; the scales have room for an error
+    of `largest_m`.
     """
     emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     step = sites[0].step or 1
     length = np.hypot(emap.gx, emap.gy)
     U = np.stack([emap.u_gx, emap.u_gy]) * k
-    factor = parts.enlargement(np.fmax(length, U.max(axis=0)), step * artifact.grid_pitch_m)
+    factor = parts.enlargement(np.fmax(np.fmax(length, largest_m), U.max(axis=0)),
+                               step * artifact.grid_pitch_m)
 
     def shown(along: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
         return np.stack([part[sites].ravel() for part in along]) * scale
@@ -140,7 +165,7 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     drawing = parts.titled(f"{'error' if of == 'stage' else of}-map",
                            title or f"Error of the {of}, {ERRORS[of]}")
     frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
-    scale = parts.Scale("e", 0.0, parts.round_end(length * UM_PER_M))
+    scale = parts.Scale("e", 0.0, parts.round_end(np.fmax(length, largest_m) * UM_PER_M))
     parts.cells(frame, artifact, length * UM_PER_M, scale)
     entries = [("ink", "measured")]
     if truth is not None:

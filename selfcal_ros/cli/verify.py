@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal verify``: is the machine better with the correction on, and if not, why not."""
+
+import argparse
+import sys
+from dataclasses import asdict, replace
+from typing import Any
+
+from selfcal_ros.bagio.offline import bag_input, collect_bag
+from selfcal_ros.cli import solve
+from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified
+from selfcal_ros.collection.settings.estimator import solver_options
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.checks.placing import PlacingError
+from selfcal_ros.estimation.checks.wiring import WiringError
+from selfcal_ros.estimation.comparison.verification import Fault, Verification, corrected, verify
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.result import CalibrationResult, with_input
+from selfcal_ros.outputs import check_outputs, plain
+from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.verification import verification_sentence, verification_text
+from selfcal_ros.results import read_result
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    parser.add_argument("map", metavar="MAP.json", help="RESULT.json whose map is corrected")
+    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder, measured with the "
+                        "correction on: a plan that identifies the stage, with any plate, or one "
+                        "view of the plate of MAP.json")
+    parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
+                        help="draw the error without and with the correction side by side")
+    parser.add_argument("--json", action="store_true", help="print JSON (docs/verify.md)")
+    solve.add_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve the bag, compare with the map, and print what the correction does."""
+    check_outputs([args.map, args.bag, args.params], [args.plot])
+    before = read_result(args.map)
+    if not before.observability.identifiable or not before.verdict.qualified:
+        raise InputError(args.map, "is not qualified, so it is not a map to correct with",
+                         "calibrate again")
+    after = _after(args, before)
+    with busy("comparing"):
+        found = verify(before, after, names=(args.map, args.bag))
+    believed = _believed(after, found)
+    sentence = verification_sentence(found)
+    if args.plot:
+        from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
+        from selfcal_ros.reporting.figures.paper import save_picture
+        save_picture(verification_picture(before, after, found, sentence), args.plot)
+    say(args, verification_text(found), _json(found, sentence, believed))
+    if not believed:
+        say_unless_qualified(after, f"selfcal verify: {args.bag}")
+    return int(ExitCode.DONE if found.passed and believed else ExitCode.NOT_QUALIFIED)
+
+
+def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:
+    """Return the map of the stage in the bag, on its own or from the plate of the map before."""
+    collector, solver = solve.parameters(args)
+    with progress_bar("reading") as bar:
+        measurements, _, lost, findings = collect_bag(
+            args.bag, collector, namespace=args.namespace,
+            progress=lambda count: bar(count, None))
+    for line in dict.fromkeys([*findings, *lost]):
+        print(f"selfcal verify: {args.bag}: {line}", file=sys.stderr)
+    source = bag_input(args.bag)
+    if before.input.get("sha256") == source["sha256"]:
+        raise InputError(args.bag, f"the recording that {args.map} was computed from, without the "
+                         "correction", "measure again with the correction on")
+    with busy("solving"):
+        return worded(with_input(_solved(args, before, measurements, solver), source, lost))
+
+
+def _solved(args: argparse.Namespace, before: CalibrationResult, measurements: Measurements,
+            solver: Any) -> CalibrationResult:
+    """Return the map by itself; if the views do not identify the stage, by the known plate."""
+    try:
+        if not measurements.artifact_from:
+            try:
+                return calibrate(measurements, solver_options(solver, measurements))
+            except NotIdentifiableError:
+                pass
+        options = solver_options(solver, measurements, plate_from=args.map)
+        return calibrate(measurements, replace(options, plate=corrected(before)))
+    except (WiringError, PlacingError) as error:
+        raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
+
+
+def _believed(after: CalibrationResult, found: Verification) -> bool:
+    """Return whether the readings with the correction on may be believed.
+
+    Against a known plate, a stage that is corrected wrongly looks like another plate.
+    """
+    named = found.fault not in (Fault.NONE, Fault.OTHER, Fault.OLDER)
+    other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
+    return after.verdict.qualified or (named and other_plate)
+
+
+def _json(found: Verification, sentence: str, believed: bool) -> dict[str, Any]:
+    return plain({
+        "sentence": sentence, "better": found.better, "passed": found.passed and believed,
+        "fault": str(found.fault), "theta_fault": str(found.theta_fault),
+        "remains": found.remains, "correlation": found.alike,
+        "axes": {name: asdict(axis) for name, axis in found.axes.items()},
+        "remaining": None if found.remaining is None else asdict(found.remaining),
+        "gx": found.gx, "gy": found.gy, "g_theta": found.g_theta})

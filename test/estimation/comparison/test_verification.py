@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What acts in machines that loaded the table rightly or wrongly, with noise and new plates."""
+
+import pytest
+
+from selfcal_ros.estimation.comparison.verification import verify
+from selfcal_ros.reporting.words.verification import verification_sentence
+from test.support.wired import WRONG, machine
+
+EXPECTED = {
+    "right": "the correction acts as the map says", "sign": "the wrong sign",
+    "exchanged": "exchanged", "unit": "look for a wrong unit", "another": "that is not this map",
+    "off": "does not act", "old": "an older table"}
+
+
+@pytest.mark.parametrize("wiring", EXPECTED)
+def test_the_sentence_names_what_acts(wiring):
+    """Three machines each; of 200 machines all but the odd map that resembles another."""
+    first = 1 + 2 * WRONG.index(wiring) if wiring in WRONG else 0
+    for seed in (first, first + 12, first + 24):
+        before, after, factor = machine(seed, wiring)
+        found = verify(before, after)
+        assert EXPECTED[wiring] in verification_sentence(found), seed
+        assert found.passed is (wiring in ("right", "old"))
+        if wiring in ("right", "sign", "unit", "off"):
+            for axis in found.axes.values():
+                assert abs(axis.factor - factor) < 5 * axis.u_factor
