@@ -49,7 +49,8 @@ def run(args: argparse.Namespace) -> int:
     sentence = verification_sentence(found)
     if args.plot:
         from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
-        from selfcal_ros.reporting.figures.paper import save_picture
+        from selfcal_ros.reporting.figures.paper import save_picture  # likewise
+
         save_picture(verification_picture(before, after, found, sentence), args.plot)
     say(args, verification_text(found), _json(found, sentence, believed))
     if not believed:
