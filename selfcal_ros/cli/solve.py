@@ -182,6 +182,8 @@ def run(args: argparse.Namespace) -> int:
             result = worded(with_places(result, measurements.views))
             _write(args, result_to_dict(created_now(
                 with_input(result, bag_input(args.bag), lost))))
+        if set(findings) - set(lost):  # a fault of the cell: a plate placed otherwise, a wrong sign
+            raise InputError(args.bag, "correct this first", f"as it is, {error}") from error
         if findings:  # missing readings look like a deficient plan
             raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
                                        error.observability) from error

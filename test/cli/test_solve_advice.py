@@ -11,6 +11,7 @@ from selfcal_ros.collection.inputs import Command, Detection, Kind, Phase
 from test.support.bags import Foreign, shuffled
 from test.support.plans import plan_of
 from test.support.sessions import events_of, small_plan, stepped_bag
+from test.support.verbs import simulate
 
 
 def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, capsys):
@@ -21,7 +22,7 @@ def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, caps
     first, *rest = capsys.readouterr().err.splitlines()
     finding = "96 of 96 detections were rejected as rotation_not_known: the view's rotation is not"
     assert first.startswith(f"selfcal solve: {path}: view 'line': {finding}")
-    assert code == 3 and len(rest) == 1  # the view of lines alone is what identifies theta
+    assert code == 2 and len(rest) == 1  # the view of lines alone is what identifies theta
     assert rest[0].startswith(f"selfcal solve: {path}: correct this first; as it is, the marks")
     mended = tmp_path / "p.yaml"
     mended.write_text("measurement_collector: {ros__parameters: {max_rotation: 0.02}}\n")
@@ -49,6 +50,19 @@ def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, 
         outputs.append(json.loads(output.read_text()))
     assert outputs[1]["rejected"] == {"command_unusable": 4}
     assert outputs[0]["error_map"] == outputs[1]["error_map"]
+
+
+@pytest.mark.parametrize("placed", [{"rotation_deg": 180}, {"rotation_deg": -90}])
+def test_a_plate_placed_otherwise_is_bad_input_and_not_a_deficient_plan(tmp_path, capsys, placed):
+    plan = {"plan_id": "p", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
+            "views": [{"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
+                      {"name": "c", "translation_pitch": [1, 0], "repeats": 2}]}
+    simulate(tmp_path, "bag", plan, placed=[{"name": "b"} | placed])
+    capsys.readouterr()
+    assert main(["solve", str(tmp_path / "bag"), "--quiet"]) == 2
+    first, last = capsys.readouterr().err.splitlines()
+    assert f"the plate lies turned by {placed['rotation_deg'] % 360}°, not by 90°" in first
+    assert "bag: correct this first; as it is, the marks" in last
 
 
 @pytest.mark.parametrize("step_s, code, way", [
