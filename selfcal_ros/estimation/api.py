@@ -7,6 +7,14 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.placing import check_placing
+from selfcal_ros.estimation.checks.turned import (
+    OTHER_LINES,
+    PAIRS,
+    Turned,
+    shows_offsets,
+    turned_error,
+    turned_readings,
+)
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.estimation.joint.camera import (
     Camera,
@@ -81,6 +89,8 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
     solved = judged(solved, measurements, options)
     result = solved.result
+    if options.method == "joint" and not _agree(result):
+        _check_turned(measurements, options)
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
     shown = {} if camera is None else camera.to_dict()
@@ -91,6 +101,29 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if measurements.has_images:
         result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
     return result
+
+
+def _agree(result: CalibrationResult) -> bool:
+    """Return whether the readings agree, whatever the sign of the offsets."""
+    verdict = result.verdict
+    return verdict.qualified or {found.name for found in verdict.failed} == {"sign_not_shown"}
+
+
+def _check_turned(measurements: Measurements, options: Options) -> None:
+    """Raise WiringError if the readings agree with another wiring of the offsets."""
+    if not shows_offsets(measurements):
+        return
+
+    def agree(wiring: Turned, options: Options) -> bool:
+        turned = turned_readings(measurements, wiring)
+        return _agree(judged(solve_joint(turned, options), turned, options).result)
+
+    plain = replace(options, causes=False)
+    fitting = [pair for pair in PAIRS if agree(pair[0], plain)]
+    candidates = fitting[0] if len(fitting) == 1 else () if fitting else (OTHER_LINES,)
+    found = [wiring for wiring in candidates if agree(wiring, options)]
+    if found:
+        raise turned_error(measurements, found)
 
 
 def robust_calibrate(measurements: Measurements,
