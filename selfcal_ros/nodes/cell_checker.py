@@ -50,6 +50,10 @@ class CellChecker(SelfcalNode[CollectorSettings]):
             self.say(Level.ERROR, "another node sends view commands: end the sequencer first")
             self._end(ExitCode.BAD_INPUT)
             return
+        for topic in (names.ENCODER.name, names.DETECTIONS.name):
+            nodes = [offer.node_name for offer in self.get_publishers_info_by_topic(
+                self.resolve_topic_name(topic))]
+            self.session.publishers[topic] = sorted(nodes)
         self.session.tick()
         for item in self.session.items[self._said:]:
             print(json.dumps(asdict(item)), flush=True)

@@ -9,15 +9,22 @@ import numpy as np
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress, expected_marks
-from selfcal_ros.collection.inputs import REMEDY, Command, EncoderSample, Phase, Reason
+from selfcal_ros.collection.inputs import (
+    REMEDY,
+    Command,
+    Detection,
+    EncoderSample,
+    Phase,
+    Reason,
+)
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, RepeatMotion
+from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.health import Ports
-from selfcal_ros.units import MS_PER_S, S_PER_NS
+from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
 """Settings of the run: marks per side in the middle of the plate, repeats, check offset."""
@@ -26,6 +33,13 @@ LISTEN_S, WATCH_S, STATUS_S, STALL_S = 2.0, 2.0, 0.5, 5.0
 detection until an incomplete view ends."""
 FOLLOWS = 0.9
 """Fraction of the variance of an offset that must follow the stage for a valid slope."""
+TURNED_DEG = 5.0
+"""Turn of the offsets against the stage beyond which they are turned."""
+CLEARLY, LEAST_TURN_RAD = 0.1, 2e-4
+"""Part of the plate's turn within which lines of the other sign show its opposite, and the least
+turn for which this is no chance."""
+ENDLESS = 1000
+"""Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 REVISIT_S = 10.0
 """Time within which a cell must revisit a missing mark."""
 OLDEST_S = 10.0
@@ -90,6 +104,8 @@ class CellCheck:
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run()
+        self.publishers: dict[str, list[str]] = {}  # topic -> nodes that publish on it
+        self._events: list[EncoderSample | Detection] = []  # of the measured view
 
     def take_encoder(self, message: Any) -> None:
         """Take a sample of the encoder."""
@@ -97,6 +113,7 @@ class CellCheck:
         self._samples.append((sample.stamp_ns, self._ports.now_ns() - sample.stamp_ns))
         self._joints.update(sample.names)
         self._collector.add_encoder(sample)
+        self._events.append(sample)
 
     def take_detection(self, message: Any) -> None:
         """Take a detection."""
@@ -104,6 +121,7 @@ class CellCheck:
         self._seen.append((self._ports.now_s(), self._ports.now_ns() - found.stamp_ns,
                            found.has_id))
         self._collector.add_detection(found)
+        self._events.append(found)
 
     def tick(self) -> None:
         """Perform due work."""
@@ -116,7 +134,8 @@ class CellCheck:
                        "publish sensor_msgs/JointState there all the time, at rest as well")
             return
         yield from self._wait(LISTEN_S)
-        self._judge_encoder()
+        if not self._judge_publishers() or not self._judge_encoder():
+            return  # everything else would follow from it
         aborted = yield from self._aborted()
         if aborted is None:
             return
@@ -134,7 +153,7 @@ class CellCheck:
 
     def _aborted(self) -> Steps[Command | None]:
         """Begin a view and abort it; return its MEASURE, None without detections."""
-        command = yield from self._place_and_measure()
+        command = yield from self._place_and_measure(replace(self.view, repeats=ENDLESS))
         first = len(self._seen)
         if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
             self._send(Phase.ABORT)
@@ -155,8 +174,8 @@ class CellCheck:
 
     def _measured(self) -> Steps[Command]:
         """Measure the view until it is complete or detections stop; return its MEASURE."""
-        self._collector, self._seen = Collector(self._settings), []
-        command = yield from self._place_and_measure()
+        self._collector, self._seen, self._events = Collector(self._settings), [], []
+        command = yield from self._place_and_measure(self.view)
         self._collector.add_command(command)
         begin = self._ports.now_s()
 
@@ -197,19 +216,18 @@ class CellCheck:
                    "sent again", "remember the stamps of executed commands and do not "
                    "execute them again")
 
-    def _place_and_measure(self) -> Steps[Command]:
-        self._send(Phase.PLACE)
+    def _place_and_measure(self, view: View) -> Steps[Command]:
+        self._send(Phase.PLACE, view)
         yield from self._wait(self._settle_s)
-        return self._send(Phase.MEASURE)
+        return self._send(Phase.MEASURE, view)
 
-    def _send(self, phase: Phase) -> Command:
+    def _send(self, phase: Phase, view: View | None = None) -> Command:
         """Send a command of its own run, stamped now."""
         stamp = max(self._ports.now_ns(), self._command.stamp_ns + 1)
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
-        placed = phase in (Phase.PLACE, Phase.MEASURE)
-        self._command = Command(stamp, phase, PLAN_ID, 0, self.view if placed else None,
-                                self.plate if placed else None, 1, run_id)
+        self._command = Command(stamp, phase, PLAN_ID, 0, view,
+                                None if view is None else self.plate, 1, run_id)
         self._publish(self._command)
         return self._command
 
@@ -245,7 +263,17 @@ class CellCheck:
     def _tell(self, name: str, passed: bool, figure: str, remedy: str = "") -> None:
         self.items.append(CheckItem(name, passed, figure, "" if passed else remedy))
 
-    def _judge_encoder(self) -> None:
+    def _judge_publishers(self) -> bool:
+        """Tell whether one node publishes each of the cell's topics; return whether it is so."""
+        several = {topic: nodes for topic, nodes in self.publishers.items() if len(nodes) > 1}
+        self._tell("publishers", not several, "; ".join(
+            f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
+            for topic, nodes in several.items()) or "one of each topic",
+            "end all but one: a simulator, a second driver, or a bag being played")
+        return not several
+
+    def _judge_encoder(self) -> bool:
+        """Tell joints, rate and clock; return whether the joints are there."""
         settings, (stamps, ages) = self._settings, np.array(self._samples).T
         joints = [settings.joint_x, settings.joint_y] + [settings.joint_theta] * self.view.angular
         missing = [joint for joint in joints if joint not in self._joints]
@@ -267,10 +295,11 @@ class CellCheck:
                    f"stamps {age * MS_PER_S:.4g} ms old when they arrive",
                    "stamp samples when they are taken, by a clock synchronised with this machine's "
                    "(NTP, PTP)")
+        return not missing
 
     def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
         rejected, used = measurements.all_rejected(), progress.readings.used
-        total = used + sum(rejected.values())
+        total = len(self._seen)
         ages = [age for _, age, _ in self._seen] or [0]
         age, earliest = (float(value) * S_PER_NS for value in (np.median(ages), min(ages)))
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
@@ -284,12 +313,17 @@ class CellCheck:
                    "without samples around them", REMEDY[Reason.MOVING])
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
-        self._tell("ids", not mistaken, f"{named} of {len(self._seen)} detections name their mark"
-                   + ("" if named else ": marks are identified by their positions")
-                   + "".join(f", {count} {reason}" for reason, count in mistaken.items()),
-                   "; ".join(REMEDY[reason] for reason in mistaken))
+        figure = f"{named} of {len(self._seen)} detections name their mark"
+        figure += "" if named else ": marks are identified by their positions"
+        figure += "".join(f", {count} {reason}" for reason, count in mistaken.items())
+        remedy = "; ".join(REMEDY[reason] for reason in mistaken)
+        if mistaken and named and self._used_exchanged() > used + sum(mistaken.values()) / 2:
+            figure = f"m and n are exchanged: {figure}"
+            remedy = "m counts the marks along plate x, n along plate y"
+        self._tell("ids", not mistaken, figure, remedy)
         self._judge_loss(progress, rejected, total)
-        self._judge_wiring(measurements)
+        if self._judge_wiring(measurements) and self.view.angular:
+            self._judge_theta(progress.readings)
 
     def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
         others = {reason: count for reason, count in rejected.items() if reason not in MISTAKEN}
@@ -305,7 +339,36 @@ class CellCheck:
                    "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
                    "(docs/cell.md)")
 
-    def _judge_wiring(self, measurements: Measurements) -> None:
+    def _used_exchanged(self) -> int:
+        """Return the number of detections that would be used with m and n exchanged."""
+        other = Collector(self._settings)
+        other.add_command(self._command)
+        for event in self._events:
+            if isinstance(event, EncoderSample):
+                other.add_encoder(event)
+            else:
+                other.add_detection(replace(event, m=event.n, n=event.m))
+        return sum(view.used for view in other.collect()[0].views)
+
+    def _judge_theta(self, readings: ViewReadings) -> None:
+        """Tell whether the lines show the turn of the plate that the marks show, or its opposite.
+
+        Unless the rotary encoder has another zero: then they show neither, which is no fault.
+        """
+        x, y = self.plate.places(readings.m, readings.n)
+        x, y = (self.plate.grid_pitch_m * (row - row.mean()) for row in (x, y))
+        by_marks = float((x * readings.dy - y * readings.dx).sum() / (x**2 + y**2).sum())
+        by_lines = float(readings.dtheta.mean()) if len(readings.dtheta) else 0.0
+        reversed_ = (abs(by_marks) > LEAST_TURN_RAD
+                     and abs(by_lines + by_marks) < CLEARLY * abs(by_marks))
+        self._tell("theta", not reversed_,
+                   f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
+                   f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad" + (
+                       ": offset_theta has the other sign" if reversed_ else ""),
+                   "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise")
+
+    def _judge_wiring(self, measurements: Measurements) -> bool:
+        """Tell whether the offsets follow the stage; return whether they do."""
         [view] = measurements.views
         faults = [worded(fault) for fault in wiring_faults(measurements)]
         slopes = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
@@ -314,10 +377,18 @@ class CellCheck:
                            if slope is not None)
         shown = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
+        remedy = "; ".join(error.remedy for error in faults)
+        turned = _turned_deg(view.motion)
+        if turned is not None and abs(turned) > TURNED_DEG and not (
+                faults and abs(turned) > 180 - TURNED_DEG):
+            shown = False
+            what = f"the offsets are turned by {turned:+.1f}° against the stage"
+            remedy = ("publish offsets along the stage's axes: turn the camera back by this angle, "
+                      "or state it (detector: turn)")
         self._tell("signs", shown and not faults,
                    what or f"offset against stage {figure or 'not known'} (-1 expected)",
-                   "; ".join(error.remedy for error in faults)
-                   or "let the stage stop off the marks: check stops")
+                   remedy or "let the stage stop off the marks: check stops")
+        return shown and not faults
 
 
 def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
@@ -328,3 +399,22 @@ def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
     place, offset, both = (float(motion.products[at]) for at in (
         (axis, axis), (n + axis, n + axis), (axis, n + axis)))
     return both / place if both**2 > FOLLOWS * place * offset else None
+
+
+def _turned_deg(motion: RepeatMotion | None) -> float | None:
+    """Return by how much the offsets are turned against the stage, counter-clockwise, degrees.
+
+    None if they do not follow it, or are mirrored.
+    """
+    if motion is None or len(motion.products) != 4:
+        return None
+    place, both, offset = (motion.products[at] for at in (
+        (slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4))))
+    if not np.linalg.det(place) > 0:
+        return None
+    response = -both @ np.linalg.inv(place)  # the offset is minus D times the motion
+    explained = np.trace(response @ place @ response.T)
+    if np.linalg.det(response) <= 0 or explained < FOLLOWS * np.trace(offset):
+        return None
+    return float(np.degrees(np.arctan2(response[1, 0] - response[0, 1],
+                                       response[0, 0] + response[1, 1])))
