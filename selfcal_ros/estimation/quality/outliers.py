@@ -17,10 +17,11 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.residuals import ROUNDING, Residuals, noisy_views, residuals_of
+from selfcal_ros.estimation.quality.residuals import Residuals, noisy_views, residuals_of
 from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Key, Measurements, left_out, without
@@ -122,7 +123,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
     flattened = _flattened(measurements, options)
     at = _Screened(measurements, flattened, residuals_of(flattened, linear))
     for _ in range(MAX_SLIPS + MAX_TERMS + 1):
-        sigma = max(robust_sigma(at.residuals.squares, 2), ROUNDING)
+        sigma = max(robust_sigma(at.residuals.squares, 2), FLOOR)
         slip = find_slip(at.residuals, sigma, at.flattened, linear)
         if slip is None:
             return at
@@ -238,7 +239,7 @@ def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, 
 
 
 def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
-    return np.nan_to_num(squares, nan=0.0) / max(sigma, ROUNDING) ** 2
+    return np.nan_to_num(squares, nan=0.0) / max(sigma, FLOOR) ** 2
 
 
 def _level(residuals: Residuals) -> float:

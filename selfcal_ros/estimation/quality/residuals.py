@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.fit import JointFit, fit
-from selfcal_ros.estimation.joint.problem import Problem
+from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import (
@@ -45,9 +45,6 @@ N_DRAWS = 64
 
 VIEW_DRAWS = 16
 """Draws of unit noise in each view, to separate the noises of the views."""
-
-ROUNDING = 1e-13
-"""Noise, m or rad, up to which residuals are rounding errors."""
 
 CHECKED = 0.05
 """Smallest 1 - h of a reading that the others can check."""
@@ -112,7 +109,7 @@ class Residuals:
         rest = float((weight * residual**2).sum()) - float(squares[at])
         if not np.isfinite(rest) or dof <= columns:
             return float("nan")
-        noise = max(rest / (dof - columns), ROUNDING**2)
+        noise = max(rest / (dof - columns), FLOOR**2)
         return float(fdtrc(columns, dof - columns, squares[at] / columns / noise))
 
 
@@ -277,7 +274,7 @@ def _by_residuals(residuals: Residuals, measurements: Measurements) -> dict[str,
     out = {}
     for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
                                          strict=True):
-        ratio = float(own / max(others, own / MAX_RATIO, ROUNDING))
+        ratio = float(own / max(others, own / MAX_RATIO, FLOOR))
         if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
             out[measurements.views[index].view.name] = ratio
     return out

@@ -18,6 +18,7 @@ from selfcal_ros.errors import (
     NotSettledError,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess, turned_marks, turned_plate
@@ -38,7 +39,6 @@ from selfcal_ros.estimation.quality.prediction import (
     of_terms,
     prediction_limit,
 )
-from selfcal_ros.estimation.quality.residuals import ROUNDING
 from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
 from selfcal_ros.model.result import CalibrationResult
@@ -199,7 +199,7 @@ def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.nd
            if term.free and term.block.by_placing]
     if own and -1 in held.rows:
         return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
-    if not (noise.sigma_xy > ROUNDING and noise.dof_xy > 0):
+    if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
         return ratio, NOTHING, None
     return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), None
 

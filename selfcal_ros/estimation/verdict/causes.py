@@ -14,7 +14,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.visits import TermInputs
-from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, FLOOR_M, Explanation
+from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, Explanation
 from selfcal_ros.estimation.verdict.off_sites import MOST, READING, SLIP
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -95,7 +95,7 @@ def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
     found = []
     for index, (name, sigma, dof) in enumerate(views):
         others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
-        if not rest or not others > FLOOR_M:
+        if not rest or not others > FLOOR:
             continue
         ratio = sigma / others
         p = float(fdtrc(dof, rest, ratio**2)) * len(views)

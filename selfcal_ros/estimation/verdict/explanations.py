@@ -19,7 +19,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
-from selfcal_ros.estimation.joint.problem import noise_excess
+from selfcal_ros.estimation.joint.problem import FLOOR, noise_excess
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.visits import without_noise
@@ -180,9 +180,6 @@ CAUSE_LEVEL = 5e-4
 """Level of the test of each term, all parts of it that are tried together."""
 
 MAX_CAUSES = 4
-
-FLOOR_M = 1e-13
-"""Noise up to which residuals are rounding errors and are not tested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,12 +373,12 @@ def _test(pool: Candidates, before: Explained, after: Explained,
     """
     gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
     variance, dof = pool.noise(after)
-    if more <= 0 or not variance > FLOOR_M**2:  # NaN where nothing is left to test against
+    if more <= 0 or not variance > FLOOR**2:  # NaN where nothing is left to test against
         return None
     p = float(fdtrc(more, dof / pool.excess, gained / more / max(variance, pool.common)))
     # of all readings together, so that explanations are compared by the same squares
     whole, n = pool.everything
-    rest = max(whole - after.explained, FLOOR_M**2)
+    rest = max(whole - after.explained, FLOOR**2)
     evidence = n * math.log1p(gained / rest) - more * math.log(n)
     return min(p * group.places, 1.0), evidence - 2 * math.log(group.places)
 

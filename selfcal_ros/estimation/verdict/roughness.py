@@ -22,6 +22,7 @@ from selfcal_ros.estimation.joint.finer import (
     with_map,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit
+from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.placed import MapSpline
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
@@ -42,9 +43,6 @@ ADEQUACY_LEVEL = 1e-3
 
 SIZES = (1e-2, 1e6, 65)
 """Trial sizes of the further coefficients, over the noise of the best one, and their number."""
-
-NOISE_FREE_M = 1e-13
-"""Noise that is rounding, m: a map that leaves no more than that suffices."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +129,12 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         if p < 1.0:
             y = other.y if p < ADEQUACY_LEVEL else model.y  # the terms of a map that suffices
             power = _Further.of(fine, coarse, y).power(
-                max(float(np.sqrt(rest / dof)), NOISE_FREE_M))
+                max(float(np.sqrt(rest / dof)), FLOOR))
         power = power + _of_terms(model, other) ** 2 * (p < ADEQUACY_LEVEL)
-    if bilinear and before > readings * NOISE_FREE_M**2:
+    if bilinear and before > readings * FLOOR**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
         if (other := with_map(model, smooth)) is not None:
-            rest = max(_squares(_of_marks(other), other.y), NOISE_FREE_M * before)
+            rest = max(_squares(_of_marks(other), other.y), FLOOR * before)
             likelier = math.exp(min((readings - n[1]) / 2 * math.log(rest / before), 0.0))
             p, apart = min(p, likelier), _apart(other, model)
             power = apart if likelier < ADEQUACY_LEVEL and apart.mean() > power.mean() else power
@@ -174,8 +172,8 @@ def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]
 
 def _improved(before: float, rest: float, more: float, dof: float) -> float:
     """Return the probability of such an improvement by chance (method eq. 12.4)."""
-    if rest < dof * NOISE_FREE_M**2:  # there is no F of rounding
-        return 1.0 if before < 4 * (dof + more) * NOISE_FREE_M**2 else 0.0
+    if rest < dof * FLOOR**2:  # there is no F of rounding
+        return 1.0 if before < 4 * (dof + more) * FLOOR**2 else 0.0
     return float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
 
 
