@@ -8,6 +8,7 @@ enlarges U; one that is not disqualifies the result. The result also states when
 taken.
 """
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -121,6 +122,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
     result = replace(
         result, verdict=verdict,
         findings=(*result.findings, *_visits_findings(checked), *_repeats_findings(measurements),
+                  *_left_out_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
@@ -252,6 +254,19 @@ def _repeats_findings(measurements: Measurements) -> list[Finding]:
     return [Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
             for name, (lost, total) in found.items()
             if lost > max(FEW_OUTLIERS, MANY_OUTLIERS * total)]
+
+
+def _left_out_findings(measurements: Measurements) -> list[Finding]:
+    """Return a finding for each view of whose detections none became a reading."""
+    used: dict[str, int] = {}
+    rejected: dict[str, Counter[str]] = {}
+    for view in measurements.views:
+        name = without_cell(view.view.name)
+        used[name] = used.get(name, 0) + view.used
+        rejected.setdefault(name, Counter()).update(view.rejected)
+    return [Finding("view_left_out", view=name, details={
+        "rejected": {str(reason): count for reason, count in rejected[name].most_common(3)}})
+            for name, count in used.items() if not count and rejected[name]]
 
 
 FIRST_DATE_NS = 365 * 86_400 * NS_PER_S

@@ -179,6 +179,9 @@ SENTENCES: dict[str, Words] = {
         f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
         "solve jointly with finite rotations, the default, which leaves "
         f"{of['residuals'] * UM_PER_M:.3g} µm"),
+    "view_left_out": lambda f, of: (
+        f"view '{f.view}' is not part of the map: none of its detections became a reading ("
+        + ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items()) + ")"),
     "noise_contradicted": lambda f, of: _noise_contradicted(f, of),
     "noise_unknown": lambda f, of: (
         "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is "
