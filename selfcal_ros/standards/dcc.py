@@ -15,7 +15,6 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import COMBINED, CalibrationResult
-from selfcal_ros.model.terms import TermName
 from selfcal_ros.reporting.chapters import convention_section, said
 from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
@@ -214,7 +213,7 @@ def _model_texts(result: CalibrationResult) -> list[str]:
         if block is not None and block.of_lines and not result.plate.angular_count:
             continue
         size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
-        of_images = term.name == TermName.MICROSCOPE and "camera" in result.extra
+        of_images = term.name == "microscope" and "camera" in result.extra
         source = "determined by the images" if of_images and term.source == "default" else (
             term.source)
         texts.append(f"term {term.name}: {size}, {source}")
