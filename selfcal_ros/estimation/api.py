@@ -15,7 +15,7 @@ from selfcal_ros.estimation.checks.turned import (
     turned_error,
     turned_readings,
 )
-from selfcal_ros.estimation.checks.wiring import check_wiring
+from selfcal_ros.estimation.checks.wiring import check_wiring, sign_is_shown
 from selfcal_ros.estimation.joint.camera import (
     Camera,
     camera_of,
@@ -106,7 +106,9 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
-    return verdict.qualified or {found.name for found in verdict.failed} == {"sign_not_shown"}
+    of_repeats = {"sign_not_shown", "scale_of_offsets"}
+    failed = {found.name for found in verdict.failed}
+    return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
 def _check_turned(measurements: Measurements, options: Options) -> None:
@@ -119,7 +121,8 @@ def _check_turned(measurements: Measurements, options: Options) -> None:
         return _agree(judged(solve_joint(turned, options), turned, options).result)
 
     plain = replace(options, causes=False)
-    fitting = [pair for pair in PAIRS if agree(pair[0], plain)]
+    shown = sign_is_shown(measurements)  # repeats beside the marks
+    fitting = [] if shown else [pair for pair in PAIRS if agree(pair[0], plain)]
     candidates = fitting[0] if len(fitting) == 1 else () if fitting else (OTHER_LINES,)
     found = [wiring for wiring in candidates if agree(wiring, options)]
     if found:
