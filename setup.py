@@ -44,7 +44,8 @@ setup(
                     "camera": ["opencv-python-headless>=4.8"],  # Apache-2.0
                     "ophyd": ["ophyd>=1.9"],  # BSD
                     "micromanager": ["pymmcore>=11.1"],  # LGPL: loaded, never shipped
-                    "pdf": ["weasyprint>=62"]},
+                    "pdf": ["weasyprint>=62"],
+                    "plate": ["ezdxf>=1.3", "gdstk>=0.9"]},
     python_requires=">=3.12",
     zip_safe=False,
     maintainer="selfcal_ros maintainers",

@@ -59,6 +59,7 @@ VERBS = {
     "certificate": Verb(CERTIFY, "write a digital calibration certificate: DCC 3.3.0 (XML)"),
     "iso230": Verb(CERTIFY, "figures of ISO 230: accuracy, circularity, diagonals"),
     "plan": Verb(CHECK, "check a plan before it is measured, or suggest views"),
+    "plate": Verb(CHECK, "draw the plate of a plan, true to size: svg, pdf, dxf or gds"),
     "simulate": Verb(CHECK, "write a bag of a simulated cell, with its known truth"),
     "step-diagonal": Verb(MORE, "axis errors from a laser step-diagonal measurement"),
     "reproduce": Verb(MORE, "repeat the published simulations of Hu or Qiao")}
@@ -101,6 +102,7 @@ EXAMPLES = {
     "iso230": "selfcal iso230 RESULT.json",
     "plan check": "selfcal plan check config/plans/hu.yaml --sigma 20nm",
     "plan suggest": "selfcal plan suggest config/plans/hu.yaml",
+    "plate": "selfcal plate config/plans/hu.yaml -o plate.svg",
     "simulate": "selfcal simulate config/simulations/general.yaml -o simulated",
     "step-diagonal": "selfcal step-diagonal config/step_diagonal/case_study.csv --method new",
     "reproduce": "selfcal reproduce hu --draws 20"}
