@@ -39,7 +39,6 @@ build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
 	@$(BIN)/python $< $(@D) || true
 test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd build/machines/.complete  ## everything: linters and all tests, ten minutes
 	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles:$(CURDIR)/build/machines$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
-	@$(MAKE) --no-print-directory test-313
 quick: setup  ## two minutes: the tests that reach most of the code
 	@$(BIN)/python -m pytest -q -n 2 -m "not ros" $(QUICK)
 test-313:  ## the quick tests with Python 3.13, where it is there
