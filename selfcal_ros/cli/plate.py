@@ -3,7 +3,7 @@
 
 import argparse
 
-from selfcal_ros.cli.terminal import tell
+from selfcal_ros.cli.terminal import add_json, say
 from selfcal_ros.collection.settings.detector import MARKS
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode
@@ -29,6 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "size)")
     parser.add_argument("--paper", choices=tuple(PAPERS_MM), help="sheet of paper to print it on, "
                         "for trying")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     art = artwork_of(plan, mark=args.mark, size_m=size, width_m=args.mark_width)
     save_artwork(art, args.output, args.paper or "")
     left, low, right, high = art.box
-    tell(f"{args.output}: {plan.artifact.m.size} marks ({args.mark}, {size:g} m), "
-         f"{plan.artifact.angular_count} lines, {right - left:.4g} x {high - low:.4g} mm; the dot "
-         "beyond a corner is beside mark (h, h)")
-    if args.paper:
-        tell(ON_PAPER)
+    lines = [f"{args.output}: {plan.artifact.m.size} marks ({args.mark}, {size:g} m), "
+             f"{plan.artifact.angular_count} lines, {right - left:.4g} x {high - low:.4g} mm; the "
+             "dot beyond a corner is beside mark (h, h)", *([ON_PAPER] if args.paper else [])]
+    say(args, "\n".join(lines), {"written": args.output, "marks": plan.artifact.m.size,
+                                 "mark_size": size})
     return int(ExitCode.DONE)

@@ -15,6 +15,7 @@ from selfcal_ros.files import read_yaml
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import read_cell
 from selfcal_ros.machine.trying import Trial
+from selfcal_ros.vision.drawing import COLOUR
 from test.support.cells import CELL, Jumping, Spoilt, write_cell
 
 PLATE = ("plan: {plan_id: c, artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}, "
@@ -72,7 +73,7 @@ def test_what_is_found_is_written_and_the_plan_is_measured_with_it(tmp_path, mon
     assert "cell.seen.png: 1 marks of" in err
     with Pillow.open("cell.seen.png") as picture:
         assert picture.size == (220, 200)
-        assert (np.asarray(picture) == (255, 80, 0)).all(axis=2).sum() > 50
+        assert (np.asarray(picture) == COLOUR).all(axis=2).sum() > 50
     data = read_yaml("cell.yaml")
     assert data["detector"]["pixel_size"] == said["pixel_size"] == pytest.approx(2e-6, rel=0.01)
     assert data["found"]["backlash_x"].keys() == {"value", "u"}

@@ -273,7 +273,7 @@ RUNS = {
     "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
     "table": "table S -o t.csv", "combine": "combine S u.csv -o mean.json",
     "certificate": "certificate S DETAILS -o c.xml", "iso230": "iso230 S",
-    "plan check": "plan check PLAN",
+    "plan check": "plan check PLAN", "plate": "plate PLAN -o plate.svg",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",
     "cal check": "cal check f.cal", "cal eval": "cal eval f.cal --position 1=1 --position 2=2",
@@ -286,7 +286,7 @@ RUNS = {
 NEEDS_NODES = {"replay", "up", "monitor", "call", "cell check"}
 ELSEWHERE = {"detect": "test_detect.py", "recheck": "test_recheck.py",
              "camera init": "test_camera.py", "measure": "test_measure.py",
-             "cell try": "test_cell_try.py"}
+             "cell try": "test_cell_try.py", "verify": "test_verify.py"}
 """Verbs whose bags are made by other tests."""
 
 

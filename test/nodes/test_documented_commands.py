@@ -16,8 +16,8 @@ from test.support.pages import ROOT, lines_of
 from test.support.sessions import plan_file, small_plan
 
 CHECKED = {"run", "launch", "topic", "service", "action", "lifecycle", "param", "interface", "bag"}
-NOT_HERE = {"security", "pkg"}
-"""What is not of the graph: the tools of SROS2, the index of packages."""
+NOT_HERE = {"security", "pkg", "control"}
+"""What is not of the graph: the tools of SROS2 and ros2_control, the index of packages."""
 OPTIONS = re.compile(r"^--?[a-z]")
 
 
