@@ -108,7 +108,7 @@ def _agree(result: CalibrationResult) -> bool:
     verdict = result.verdict
     of_repeats = {"sign_not_shown", "scale_of_offsets"}
     failed = {found.name for found in verdict.failed}
-    return verdict.qualified or (bool(failed) and failed <= of_repeats)
+    return verdict.qualified or failed <= of_repeats
 
 
 def _check_turned(measurements: Measurements, options: Options) -> None:
@@ -122,7 +122,7 @@ def _check_turned(measurements: Measurements, options: Options) -> None:
 
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks
-    fitting = [] if shown else [pair for pair in PAIRS if agree(pair[0], plain)]
+    fitting = [] if shown else [pair for pair in PAIRS if any(agree(one, plain) for one in pair)]
     candidates = fitting[0] if len(fitting) == 1 else () if fitting else (OTHER_LINES,)
     found = [wiring for wiring in candidates if agree(wiring, options)]
     if found:
