@@ -16,7 +16,7 @@ ELSEWHERE = {"up": "needs ROS", "monitor": "needs ROS", "call": "needs a cell",
              "cell check": "needs a cell", "cell try": "asks before each motion",
              "measure": "test/cli/test_measure.py", "replay": "test/tools/test_demo.py",
              "camera init": "needs a bag of its own", "recheck": "test/cli/test_recheck.py",
-             "diff": "below", "combine": "below",
+             "diff": "below", "combine": "below", "verify": "test/cli/test_verify.py",
              "reproduce": "slow: test/cli/test_reproduce_verb.py"}
 """Verbs whose example is not run here, and why."""
 ALL = """
