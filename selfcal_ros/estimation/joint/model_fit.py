@@ -287,14 +287,10 @@ class _State:
         inverse = free_inverse(equations)
         sums = residual_sums(equations, now, inverse)
         total, dof = _of_lines(self.problem, self.found, equations, inverse, inverse @ now.total)
-        few = sums.dof_between - dof < FEW_DOF or total > sums.between
-        if few:
+        if sums.dof_between - dof < FEW_DOF or total > sums.between:
             total, dof = 0.0, 0.0
-        residuals = sigma_of(sums.between - total, sums.dof_between - dof)
-        if few and self.steps > OFFSET_STEPS:  # it follows the weight of lines, which follows it
-            residuals = self.problem.residuals_xy or residuals
         self.problem = replace(
-            self.problem, residuals_xy=residuals,
+            self.problem, residuals_xy=sigma_of(sums.between - total, sums.dof_between - dof),
             repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
             else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0

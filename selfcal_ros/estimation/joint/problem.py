@@ -24,9 +24,6 @@ LEAST_DOF = 0.5
 """Degrees of freedom of residuals below which they are rounding: terms with sizes leave fractions
 of one, however small."""
 
-DECLARED_DOF = 8.0
-"""Degrees of freedom of a declared noise: it is known to a quarter (GUM G.4.2)."""
-
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
@@ -48,10 +45,9 @@ class NoiseEstimate:
     ----------
     sigma : float
         Standard deviation of one reading behind the uncertainties; NaN if unknown. If repeats
-        (or the declaration) and residuals contradict each other it is the larger one. A declared
-        noise is that of declaration and residuals together, if that is larger.
+        (or the declaration) and residuals contradict each other it is the larger one.
     dof : float
-        Its degrees of freedom.
+        Its degrees of freedom; infinite if the detections declare it.
     repeats, residuals : float
         The two estimates, NaN if none.
     dof_repeats, dof_residuals : float
@@ -136,10 +132,7 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
         dof_repeats=repeats[1], dof_residuals=residuals[1], declared=declared, p=p)
     if found.contradicted:
         sigma, dof = max(base, residuals)
-        return replace(found, sigma=sigma, dof=dof)
-    if np.isfinite(declared):
-        both, dof = pooled(((declared, DECLARED_DOF), residuals))
-        return replace(found, sigma=max(declared, both), dof=dof)
+        found = replace(found, sigma=sigma, dof=dof)
     return found
 
 
@@ -158,9 +151,8 @@ ROUNDING = 16 * np.finfo(float).eps
 FLOOR = 1e-13
 """Noise, m or rad, that is rounding and not tested."""
 
-LEAST_NOISE_RAD = 1e-9
-"""Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all
-that is assumed."""
+LEAST_NOISE_RAD = 1e-10
+"""Noise of lines that counts in weights at least: less is rounding."""
 
 NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 """Noise that stands for none: its square is still a number."""
