@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of solver: readings solved together, results published and saved."""
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -371,7 +372,7 @@ class SolvingSession:
             raise problem or NoDataError("solver", "there is no map yet",
                                          "measure the views of the plan")
         target = result_file(path, self._settings.result_folder)
-        if problem is not None and target.exists():
+        if problem is not None and os.path.exists(target):
             raise problem
         write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
         if problem is not None:
