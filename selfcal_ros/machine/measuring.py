@@ -427,5 +427,3 @@ def _named(progress: ViewProgress) -> str:
 def _rejected(progress: ViewProgress) -> str:
     found = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[:3]
     return f" (rejected: {', '.join(f'{name} {count}' for name, count in found)})" if found else ""
-
-

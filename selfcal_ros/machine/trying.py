@@ -308,4 +308,3 @@ def values_of(findings: Findings) -> tuple[dict[str, object], dict[str, str]]:
     u_turn = math.degrees(camera.u_turn_rad)
     return ({"pixel_size": camera.pixel_size_m, "turn": turn, "mirror": camera.mirror},
             {"pixel_size": f"u {camera.u_pixel_size_m:.2g} m", "turn": f"u {u_turn:.2g} degrees"})
-

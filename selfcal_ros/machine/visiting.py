@@ -449,5 +449,3 @@ def _around(before: EncoderSample, found: list[Detection],
     """Yield the detections of an exposure among the positions before and after it."""
     events: list[EncoderSample | Detection] = [*_track(before, after), *found]
     yield from sorted(events, key=lambda event: event.stamp_ns)
-
-

@@ -113,11 +113,14 @@ def test_marks_are_found_at_the_bound(bench, monkeypatch):
     """Two images: 36 errors a row, so their rms is within 4 sigma of the bound, or 47 % of it."""
     detecting = importlib.import_module("detecting")
     monkeypatch.setattr(detecting, "RATIOS", (50,))
+    monkeypatch.setattr(detecting, "MANY", (5,))
     out, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--images", "2")
     assert [row["benchmark"] for row in rows if row["method"] == "selfcal"] == [
-        f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")]
+        *(f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")), "detect many"]
     for row in rows:
-        if row["method"] == "selfcal":
+        if row["benchmark"] == "detect many":
+            assert row["seconds"] is None or row["found"] == 1.0
+        elif row["method"] == "selfcal":
             assert row["found"] == 1.0 and 0.53 < row["rms_px"] / row["bound_px"] < 1.47
             assert row["max_error"] < 0.05 * 2e-6
         else:

@@ -142,8 +142,8 @@ _CAUSES: dict[str, Words] = {
         f"{c.size:.2f} times as much noise in view '{c.view}' as in the others")}
 
 _ACTIONS = {
-    "microscope": "align the microscope, or have the stage stop next to the marks "
-                         "deliberately (check_stops)",
+    "microscope": "align the microscope, or have the stage stop next to the marks deliberately "
+                  "(check_stops)",
     "drift": "visit the marks there and back",
     "plate_scale": "let the plate reach thermal equilibrium",
     "plate_shape": "support the plate without strain",
@@ -152,8 +152,8 @@ _ACTIONS = {
     "yaw": "declare a larger yaw:SIZE",
     "approach": "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
-    "rotation": "check whether the plate moved between marks and lines, and the sign of "
-                       "the lines' offsets",
+    "rotation": "check whether the plate moved between marks and lines, and the sign of the "
+                "lines' offsets",
     "reading": "solve with --robust, or measure it again",
     "off_sites": "place the plate closer to its nominal pose, or send the stage to the sites",
     "roughness": "give the map more nodes, or harmonics if it is the angular one (map in the "
