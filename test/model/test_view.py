@@ -272,7 +272,7 @@ def test_a_plan_knows_its_microscope():
     with pytest.raises(InputError, match=r"^p: microscope: model_terms has a microscope as well; "
                        "leave one of them out$"):
         plan_from_dict(plan_with(microscope={"scale_u": 0.1}, model_terms=["microscope"]), "p")
-    with pytest.raises(InputError, match="p: microscope: microscope: the size 2 is"):
+    with pytest.raises(InputError, match="p: microscope: the size 2 is"):
         plan_from_dict(plan_with(microscope={"shear_u": 2.0}), "p")
 
 

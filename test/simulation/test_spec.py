@@ -154,7 +154,8 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ("[1]", ": not a mapping; see docs/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
-     "physics, placed, noise, cell, faults, camera, seed, noise_seed, start_time, compression"),
+     "physics, placed, noise, cell, faults, camera, correction, seed, noise_seed, start_time, "
+     "compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see the examples in config"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
