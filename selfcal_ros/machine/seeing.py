@@ -90,8 +90,9 @@ class Eye:
         self.newest = self._before[0]
         if last is not None and np.array_equal(last[0], pixels) and np.abs(np.subtract(
                 last[1][:2], position[:2])).max() > MOVED_M:
-            raise MachineError("the camera returns the last image again after a move",
-                               "machine.image", "let it expose anew for every image")
+            raise MachineError("the camera returns the last image again after a move, or is late "
+                               "by one frame", "machine.image", "let it expose when it is asked "
+                               "(software trigger), or drop a frame")
         if (pixels >= full).mean() > SATURATED:
             raise MachineError("the image is saturated", "machine.image",
                                "shorten the exposure, or reduce the light")

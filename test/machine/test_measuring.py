@@ -93,7 +93,7 @@ AT_FIRST = [
     ("indicates exchanged axes", "y moved instead: the axes are exchanged"),
     ("indicates reversed x", "the opposite direction: x is reversed"),
     ("frozen position", "nothing moved: its position is frozen"),
-    ("late by one frame", "the image is late by one frame"),
+    ("late by one frame", "late by one frame"),
     ("mirrored camera", "the opposite direction: x is reversed")]
 
 
