@@ -108,7 +108,7 @@ def test_bags(run, tmp_path):
 
 
 def targets() -> set[str]:
-    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    return set(re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(), re.M))
 
 
 def test_make_has_the_targets_that_are_named():
@@ -126,4 +126,4 @@ def test_make_has_the_targets_that_are_named():
 def test_make_help_names_every_target():
     said = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True,
                           check=True).stdout
-    assert set(re.findall(r"[a-z-]+", said)) - {"make"} == targets() - {"help"}
+    assert set(re.findall(r"^make ([a-z0-9-]+) +\S", said, re.M)) == targets()
