@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.turned import (
     OTHER_LINES,
@@ -118,7 +118,11 @@ def _check_turned(measurements: Measurements, options: Options) -> None:
 
     def agree(wiring: Turned, options: Options) -> bool:
         turned = turned_readings(measurements, wiring)
-        return _agree(judged(solve_joint(turned, options), turned, options).result)
+        try:
+            solved = solve_joint(turned, options)
+        except NotSettledError:
+            return False
+        return _agree(judged(solved, turned, options).result)
 
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks
