@@ -108,7 +108,7 @@ def _agree(result: CalibrationResult) -> bool:
     verdict = result.verdict
     of_repeats = {"sign_not_shown", "scale_of_offsets"}
     failed = {found.name for found in verdict.failed}
-    return verdict.qualified or failed <= of_repeats
+    return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
 def _check_turned(measurements: Measurements, options: Options) -> None:
