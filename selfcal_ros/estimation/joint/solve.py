@@ -20,7 +20,7 @@ from selfcal_ros.estimation.datum.angular import (
     conditions_for,
     misclosure_test,
 )
-from selfcal_ros.estimation.datum.covariance import MapsCovariance, scale_of
+from selfcal_ros.estimation.datum.covariance import NO_NOISE_M, MapsCovariance, scale_of
 from selfcal_ros.estimation.joint.finer import fit_model
 from selfcal_ros.estimation.joint.fit import noise_gain
 from selfcal_ros.estimation.joint.images import IMAGES, image_noise
@@ -158,14 +158,16 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     problem, found = model.problem, model.found
     asked = options.uncertainty
     wanted = problem.system.grid.n_sites <= UNASKED_SITES if asked is None else asked
-    sigma = np.full(problem.system.known_sites.shape, found.xy.sigma)
+    exact = options.reference is not None and found.xy.sigma == 0
+    least = NO_NOISE_M if exact else found.xy.sigma  # 0 would hide the u of the reference
+    sigma = np.full(problem.system.known_sites.shape, least)
     if wanted:
         sigma = sigma * noise_gain(problem, found)
     cover = None
     # the datum of the axes is tested in any case
     if wanted or problem.conditions.datum is ThetaDatum.XY_AXES:
         cover = MapsCovariance(problem.system, found.inverse, options.reference, terms=model.spread,
-                               half_width_m=problem.half_width_m, sigma_m=found.xy.sigma)
+                               half_width_m=problem.half_width_m, sigma_m=least)
     error_map, closure, kept = _error_map(measurements, model, cover, sigma, wanted=wanted)
     artifact_map = _artifact_map(model, cover if wanted else None, rms(sigma))
     findings = (*_unchecked(problem.system, measurements.sense),
