@@ -95,7 +95,6 @@ def _complete() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return its exit code."""
     try:
-        hold_interrupts(held=False)  # by `start`
         if COMPLETE in os.environ:
             _complete()
         code = _run(sys.argv[1:] if argv is None else argv)
@@ -110,6 +109,7 @@ def _run(words: list[str]) -> int:
     """Run one verb; an error is one line on stderr."""
     prefix, args = "selfcal", None
     try:
+        hold_interrupts(held=False)  # by `start`
         if words[:1] == ["help"]:
             words = [*words[1:], "--help"]
         parser = build_parser(_verb_in(words))

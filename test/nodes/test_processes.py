@@ -24,6 +24,7 @@ from test.support.sessions import plan_file, small_bag, small_plan
 from test.support.shared_memory import remove_stale
 from test.support.waiting import PATIENCE_S, wait_until
 
+SIMULATED_CELL = Path(__file__).parents[2] / "config/cells/simulated.yaml"
 SELFCAL = "import sys; from selfcal_ros.cli.main import main; sys.exit(main())"
 
 
@@ -84,7 +85,7 @@ def ended(process: subprocess.Popen | Fork) -> tuple[int, str, str]:
 
 SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGTERM,
            "solver": signal.SIGTERM, "compensator": signal.SIGINT, "mark_detector": signal.SIGTERM,
-           "bag_player": signal.SIGTERM,
+           "bag_player": signal.SIGTERM, "cell_driver": signal.SIGINT,
            "bag_recorder": signal.SIGTERM, "stage_simulator": signal.SIGINT}
 """One for each node: all of them take both through the same lines; `selfcal up` sends SIGTERM."""
 
@@ -93,6 +94,7 @@ def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
     needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001", "-p", "beside_others:=true"],
               "bag_recorder": ["-p", f"bag:={recorded}"],
+              "cell_driver": ["-p", f"cell:={SIMULATED_CELL}"],
               "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
               "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"]}
     diagnostics: list = []

@@ -121,7 +121,7 @@ def test_a_calibration_by_words_past_the_death_of_two_nodes(start, tmp_path):
             up.until("solver ended with signal 9: restarted")
         up.write("confirm")
     *_, line = up.until_all("now: Done. s starts another run.",
-                            "map: Calibrated from 4 views: largest error ", "saved: ")
+                            "map: Good: error up to ", "saved: ")
     saved = Path(line.removeprefix("saved: "))
     assert saved.parent == tmp_path
     assert re.fullmatch(r"plan_simulated_\d{19}\.json", saved.name)
@@ -155,7 +155,7 @@ def test_a_good_run_says_no_error_and_a_stop_signal_takes_its_nodes_along(start,
     for view in ("line", "identity", "rot90", "shift"):
         up.until(f"PLACE {view}")
         up.write("confirm")
-    up.until("map: Calibrated from 4 views: ")
+    up.until("map: Good: error up to ")
     up.process.send_signal(signal.SIGTERM)
     assert up.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
     wait_until(lambda: not processes_of(up.process.pid), "all nodes to end")
