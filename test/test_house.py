@@ -37,7 +37,7 @@ def imports(path: Path) -> set[str]:
 
 def documented() -> dict[str, set[str]]:
     """Return package -> packages that it imports, from the top to the bottom of the table."""
-    page = (ROOT / "docs/architecture.md").read_text()
+    page = (ROOT / "docs/theory/architecture.md").read_text()
     section = page.partition("## Layers")[2].partition("Inside `estimation`")[0]
     return {name: set(re.findall(r"`(\w+)`", cell)) for name, cell in ROW.findall(section)}
 

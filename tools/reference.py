@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make reference`: docs/reference.md from the code that reads and writes what it describes."""
+"""`make reference`: the page of that name from code that reads and writes what it describes."""
 
 import re
 import sys
@@ -19,7 +19,7 @@ from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.spec import Faults
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs/reference.md"
+PAGE = ROOT / "docs/reference/reference.md"
 HEAD = """# Reference
 
 Keys of PLAN.yaml, SIM.yaml and RESULT.json, parameters of the nodes, messages. Written by
@@ -30,11 +30,11 @@ PLAN = {
     "plan_id": "name of the plan; a plan has one plate",
     "artifact": "the plate", "views": "list of views, in their order",
     "visit_order": "order of the marks in views without their own "
-                   "(docs/identifiability.md); default: chosen by the cell",
+                   "(docs/guides/identifiability.md); default: chosen by the cell",
     "model_terms": "list of TERM or TERM:SIZE to be estimated with the map; default: none",
     "artifact_from": "RESULT.json of the calibration that made the plate known, relative to the "
-                     "plan (docs/recheck.md); `artifact` and `map` are then those of the result "
-                     "unless given; default: the plate is not known",
+                     "plan (docs/guides/recheck.md); `artifact` and `map` are then those of the "
+                     "result unless given; default: the plate is not known",
     "microscope": "standard uncertainties of the microscope; default: the solver's "
                   "parameters of these names",
     "microscope.scale_u": "of its scale, m/m; default 0.01",
@@ -42,20 +42,20 @@ PLAN = {
     "microscope.shear_u": "of half the difference of its scales, and of half its error of "
                           "squareness, m/m; default 0.002",
     "check_stops": "marks of each grid view that are measured four more times, the stage "
-                   "deliberately off them (docs/cell.md); default: none",
+                   "deliberately off them (docs/start/cell.md); default: none",
     "check_stops.marks": "how many marks",
     "check_stops.offset": "distance of the stage from the mark, m; at most a quarter of the pitch",
     "map": "nodes of the error map where they are not the sites of the plate's lattice "
-           "(docs/identifiability.md); default: those sites, or for views off the lattice three "
-           "quarters as many nodes as marks over the same field",
+           "(docs/guides/identifiability.md); default: those sites, or for views off the lattice "
+           "three quarters as many nodes as marks over the same field",
     "map.grid_size": "nodes along x, from 3",
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
     "map.harmonics": "harmonics of the angular map, fewer than half the lines: a Fourier series, "
                      "for lines at any turn; default: a value for each line",
     "map.grid_size_y": "nodes along y if the map is not square; default: as along x",
-    "image": "marks that an image shows: detections of one stamp are one image (docs/bags.md); "
-             "default: one mark",
+    "image": "marks that an image shows: detections of one stamp are one image "
+             "(docs/reference/bags.md); default: one mark",
     "image.nx": "marks along stage x, odd; the middle one is on the optical axis",
     "image.ny": "marks along stage y, odd",
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
@@ -224,7 +224,7 @@ def text(result: dict[str, Any]) -> str:
         raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
     lines = [HEAD, "## PLAN.yaml", "",
              *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")), "",
-             "## SIM.yaml", "", "Meaning of the keys: docs/simulate.md.", "",
+             "## SIM.yaml", "", "Meaning of the keys: docs/guides/simulate.md.", "",
              *table(("key", "default", "allowed", "unit"), sim_rows()), "",
              "## RESULT.json", "", *table(("key", "meaning"), described(
                  list(result), RESULT, "RESULT.json")), "",

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effect of set-up faults on both formulations of the step-diagonal measurement.
 
-The table of docs/step_diagonal.md: each fault simulated on the machine of the source's case study.
+The table of docs/guides/step_diagonal.md: each fault simulated on the machine of the source's case
+study.
 
     .venv/bin/python tools/sensitivity.py [--plot FILE]
 """

@@ -28,7 +28,7 @@ PER = "_per_"
 NO_INFLUENCE = ("save_path", "result_folder", "autostart", "status_period", "frame_id")
 """Parameters without effect on a result."""
 Record = dict[str, Any]
-"""Record of a bag: JSON, schema `SCHEMA`, see docs/batch.md."""
+"""Record of a bag: JSON, schema `SCHEMA`, see docs/guides/batch.md."""
 LOCK = ".lock"
 
 

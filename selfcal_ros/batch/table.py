@@ -122,7 +122,7 @@ def _field(value: Any) -> Any:
 
 
 def batch_json(records: Sequence[Record], found: Sequence[PlanHistory], done_before: int) -> dict:
-    """Return the whole batch as one JSON object, docs/batch.md."""
+    """Return the whole batch as one JSON object, docs/guides/batch.md."""
     counts = {name: sum(code == r["exit_code"] for r in records) for name, code in (
         ("qualified", 0), ("not_qualified", 5))}
     return {"schema": SCHEMA, "bags": len(records), **counts,

@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "of a mark around the present position: pixel size, turn, mirror, backlash and settling "
         "time, written into CELL.yaml with their standard uncertainties. Needs no ROS.")
     attempt.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector with mark "
-                         "and mark_size (docs/machines.md)")
+                         "and mark_size (docs/start/machines.md)")
     attempt.add_argument("--mark-pixels", metavar="PX", type=float, default=0.0,
                          help="size of a mark in the image, pixels; default: it is searched for")
     attempt.add_argument("--yes", action="store_true", help="move without asking")

@@ -17,7 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", metavar="RESULT.json", help="result of `selfcal solve` or "
                         "`selfcal combine`")
     parser.add_argument("details", metavar="DETAILS.yaml", help="laboratory, customer, item, "
-                        "persons, conditions (docs/certificate.md)")
+                        "persons, conditions (docs/guides/certificate.md)")
     parser.add_argument("-o", "--output", metavar="DCC.xml", required=True,
                         help="certificate to write; - = stdout")
     parser.add_argument("--covariance", action="store_true",

@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "solves at the end. Ctrl-C stops the stage; --resume continues.")
     parser.add_argument("plan", metavar="PLAN.yaml", help="plan with plate and views")
     parser.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector "
-                        "(docs/machines.md)")
+                        "(docs/start/machines.md)")
     parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
                         "create; the result is written beside it, BAG.json and BAG.html")
     parser.add_argument("--yes", action="store_true", help="ask nothing: the plate is placed by a "

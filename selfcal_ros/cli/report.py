@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "wrote: add the error of a simulated controller before and after it")
     parser.add_argument("--details", metavar="DETAILS.yaml", help="add the contents of a "
                         "certificate: laboratory, customer, item, conditions "
-                        "(docs/certificate.md), traceability, U of distances")
+                        "(docs/guides/certificate.md), traceability, U of distances")
     for name, what in (("stage", "name of the stage"), ("serial-number", "its serial number"),
                        ("operator", "who calibrated it")):
         parser.add_argument(f"--{name}", metavar="TEXT", default="",

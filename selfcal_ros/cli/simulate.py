@@ -10,7 +10,8 @@ from selfcal_ros.simulation.spec import read_simulation
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("sim", metavar="SIM.yaml", help="what to simulate (docs/simulate.md)")
+    parser.add_argument("sim", metavar="SIM.yaml",
+                        help="what to simulate (docs/guides/simulate.md)")
     parser.add_argument("-o", "--output", metavar="BAG", required=True,
                         help="bag folder to create; truth.json is written into it")
     parser.add_argument("--png", action="store_true", help="of a cell with a camera: write a "

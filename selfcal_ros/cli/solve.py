@@ -93,7 +93,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
                         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
                         "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
-                        "terms, not even those assumed by default (docs/estimation.md)")
+                        "terms, not even those assumed by default (docs/theory/estimation.md)")
     parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
                         help="standard uncertainties of the microscope's scale, rotation (rad) "
                         "and shear (default: 0.01:0.01:0.002)")

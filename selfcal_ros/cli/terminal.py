@@ -24,7 +24,8 @@ STDOUT = "-"
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
     """Add the option ``--json``."""
-    parser.add_argument("--json", action="store_true", help=f"print {what} (docs/json.md)")
+    parser.add_argument("--json", action="store_true",
+                        help=f"print {what} (docs/reference/json.md)")
 
 
 def add_parameters(parser: argparse._ActionsContainer, kind: type[Settings],

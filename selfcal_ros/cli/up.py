@@ -36,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detect", action="store_true",
                         help="find marks in stage/image as well (mark_detector in NODES.yaml)")
     parser.add_argument("--cell", metavar="CELL.yaml", help="machine to be driven by cell_driver "
-                        "(docs/machines.md)")
+                        "(docs/start/machines.md)")
     parser.add_argument("--simulate", action="store_true",
                         help="also run a simulated cell, to try it out")
 

@@ -188,7 +188,7 @@ def _mapping(data: Any, where: str) -> dict[str, Any]:
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise InputError(where, "not a mapping", "see docs/machines.md")
+        raise InputError(where, "not a mapping", "see docs/start/machines.md")
     return data
 
 

@@ -110,7 +110,7 @@ def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
             if verdict == QoSCompatibility.ERROR:
                 why = reason.removeprefix("ERROR: ").rstrip(";. ")
                 found.append(f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
-                             "offer the QoS in docs/ros2.md")
+                             "offer the QoS in docs/reference/ros2.md")
     return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
 
 

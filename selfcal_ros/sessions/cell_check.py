@@ -337,7 +337,7 @@ class CellCheck:
         self._tell("check stops", progress.check_done >= progress.check_expected,
                    f"{progress.check_done} of {progress.check_expected} marks from all four sides",
                    "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
-                   "(docs/cell.md)")
+                   "(docs/start/cell.md)")
 
     def _used_exchanged(self) -> int:
         """Return the number of detections that would be used with m and n exchanged."""

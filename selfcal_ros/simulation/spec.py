@@ -252,7 +252,7 @@ def read_simulation(path: str | Path) -> Simulation:
     Keys: ``plan`` (a path relative to the file, or an inline plan), ``seed``, ``noise_seed``,
     ``truth``, ``physics`` (fields of `Spread`), ``placed``, ``noise``, ``cell`` (fields of
     `CellSettings`), ``faults`` (fields of `Faults`), ``camera`` (fields of `Camera`),
-    ``correction``, ``start_time`` (s), ``compression``; see docs/simulate.md. SI units.
+    ``correction``, ``start_time`` (s), ``compression``; see docs/guides/simulate.md. SI units.
 
     Raises
     ------
@@ -380,7 +380,7 @@ def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
 
 def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:
     if not isinstance(data, dict):
-        raise InputError(where, "not a mapping", "see docs/simulate.md")
+        raise InputError(where, "not a mapping", "see docs/guides/simulate.md")
     for key in data:
         if key not in known:
             raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))

@@ -251,7 +251,7 @@ def test_every_verb_takes_json_and_is_documented(name):
     import selfcal_ros
 
     assert "--json" in LEAVES[name]._option_string_actions
-    docs = Path(selfcal_ros.__file__).parents[1] / "docs" / "json.md"
+    docs = Path(selfcal_ros.__file__).parents[1] / "docs/reference/json.md"
     assert f"`{name}`" in docs.read_text()
 
 

@@ -52,8 +52,8 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
 
 
 def documented(node):
-    """Return name, default, bounds and unit of each parameter as docs/reference.md has them."""
-    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text()
+    """Return name, default, bounds and unit of each parameter as the reference has them."""
+    page = (Path(__file__).parents[2] / "docs/reference/reference.md").read_text()
     _, _, section = page.partition("## Parameters")[2].partition(f"### {node}\n")
     for line in section.partition("\n### ")[0].splitlines():
         if line.startswith("| `"):

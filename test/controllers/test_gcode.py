@@ -350,7 +350,7 @@ def test_the_polygon_of_few_points_stays_within_the_tolerance():
 
 
 def test_the_page_lists_the_known_codes_with_their_words():
-    page = (Path(__file__).parents[2] / "docs/controllers.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/guides/controllers.md").read_text()
     rows = [re.split(r"\s*\|\s*", line)[1:-1] for line in page.splitlines() if line[:2] == "| "]
     head = next(row for row in rows if row[1:] == list(DIALECTS))
     listed = {(dialect, name, words, row[0].partition(":")[0])

@@ -163,7 +163,7 @@ def test_a_plan_is_judged_as_the_dense_solution():
 
 @pytest.mark.parametrize(("nodes", "gain"), [(5, 0.6798), (7, 0.8200)])
 def test_three_views_determine_a_lattice_of_even_sides(nodes, gain):
-    """As docs/identifiability.md says: 0, 90 deg and a shift by a pitch."""
+    """As docs/guides/identifiability.md says: 0, 90 deg and a shift by a pitch."""
     artifact = lattice(8, nodes=nodes)
     views = (View("0", 0.0), View("90", np.pi / 2),
              View("shift", 0.0, (artifact.grid_pitch_m, 0.0)))

@@ -73,7 +73,7 @@ def test_commands_run(page, desk, capsys):
 
 
 def test_the_tutorial_is_run_from_its_beginning_to_its_end():
-    steps = [command for command, _ in commands((ROOT / "docs/tutorial.md").read_text())]
+    steps = [command for command, _ in commands((ROOT / "docs/start/tutorial.md").read_text())]
     assert sum(not parsed_alone(command) for command in steps) == 9
     assert {shlex.split(command)[1] for command in steps} == {
         "plan", "simulate", "solve", "cal", "up"}
@@ -90,7 +90,7 @@ def test_what_faq_quotes_is_what_the_code_says():
     """Each quoted message occurs in the source, where values stand for its blanks."""
     source = re.sub(r'"\s*\n?\s*f?"', "", "".join(
         path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))))
-    quoted = re.findall(r"^### `(.+)`$", (ROOT / "docs/faq.md").read_text(), re.M)
+    quoted = re.findall(r"^### `(.+)`$", (ROOT / "docs/start/faq.md").read_text(), re.M)
     assert len(quoted) >= 12
     for message in quoted:
         for part in re.split(" … |`, `", message):

@@ -68,9 +68,10 @@ def test_the_index_names_every_verb_and_every_page_of_the_documentation():
     index = (ROOT / "docs/index.md").read_text()
     for verb in VERBS:
         assert f"selfcal {verb}" in index
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")}
-    assert set(re.findall(r"\]\(([\w.]+\.md)\)", index)) == pages - {"index.md"}
-    assert set(re.findall(r"[\w]+\.md", (ROOT / "mkdocs.yml").read_text())) == pages
+    docs = ROOT / "docs"
+    pages = {str(page.relative_to(docs)) for page in docs.rglob("*.md")}
+    assert set(re.findall(r"\]\(([\w./]+\.md)\)", index)) == pages - {"index.md"}
+    assert set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())) == pages
 
 
 def test_the_links_of_the_readme_lead_somewhere():

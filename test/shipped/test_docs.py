@@ -11,7 +11,7 @@ from selfcal_ros.collection.inputs import Reason
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
 ROOT = Path(__file__).parents[2]
-BAGS = (ROOT / "docs/bags.md").read_text()
+BAGS = (ROOT / "docs/reference/bags.md").read_text()
 
 
 def test_every_reason_and_every_parameter_of_the_collector_is_explained():
@@ -22,7 +22,7 @@ def test_every_reason_and_every_parameter_of_the_collector_is_explained():
 
 
 def test_the_simulation_of_the_documentation_runs(tmp_path, capsys):
-    text = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/simulate.md").read_text(), re.S)[1]
+    text = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/guides/simulate.md").read_text(), re.S)[1]
     spec = tmp_path / "sim.yaml"
     spec.write_text(text.replace("../plans", str(ROOT / "config/plans")))
     assert main(["simulate", str(spec), "-o", str(tmp_path / "bag")]) == 0
@@ -41,7 +41,7 @@ def test_every_verb_explains_itself(verb, capsys):
     assert f"usage: selfcal {verb}" in capsys.readouterr().out
 
 
-METHOD = (ROOT / "docs/method.md").read_text()
+METHOD = (ROOT / "docs/theory/method.md").read_text()
 CITED = re.compile(r"method eqs?\. (\d+\.\d+)(?:(-|, )(\d+\.\d+))?")
 
 

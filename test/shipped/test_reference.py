@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/reference.md is what `make reference` writes, and papers of the project agree with it."""
+"""The reference is what `make reference` writes, and papers of the project agree with it."""
 
 import importlib.util
 from pathlib import Path

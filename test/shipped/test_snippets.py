@@ -23,7 +23,8 @@ TOPIC = ("/stage/joint_states", "sensor_msgs/msg/JointState")
 
 def snippets(name: str) -> list[str]:
     """Return the blocks of Python of a page."""
-    text = (ROOT / "docs" / name).read_text()
+    [page] = (ROOT / "docs").rglob(name)
+    text = page.read_text()
     return re.findall(r"```python\n(.*?)```", text, re.S)
 
 

@@ -151,15 +151,15 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
 
 
 @pytest.mark.parametrize(("data", "message"), [
-    ("[1]", ": not a mapping; see docs/simulate.md"),
+    ("[1]", ": not a mapping; see docs/guides/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
      "physics, placed, noise, cell, faults, camera, correction, seed, noise_seed, start_time, "
      "compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see the examples in config"),
-    ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/simulate.md"),
-    ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/simulate.md"),
+    ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/guides/simulate.md"),
+    ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/guides/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
      "are sigma_xy, sigma_theta, noise_ratio, visit_xy, image_xy, flicker_xy, flicker_theta, "
      "resolution_xy, resolution_theta"),
@@ -292,7 +292,7 @@ def test_a_simulated_cell_is_by_default_what_a_simulation_is_but_for_hus_noise()
     ("truth", TRUTH, Spread()), ("physics", PHYSICS, Spread()), ("noise", NOISE, CellSettings()),
     ("cell", CELL, CellSettings()), ("faults", FAULTS, Faults())])
 def test_numbers_are_those_of_the_documents(name, keys, defaults):
-    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/reference/reference.md").read_text()
     rows = [line[2:].split(" | ") for line in page.splitlines()
             if line.startswith(f"| `{name}.")]
     assert [row[0] for row in rows] == [f"`{name}.{key}`" for key in keys]

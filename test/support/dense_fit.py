@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A measurement with terms as one dense least squares: the slow way, for comparison.
 
-Written from docs/method.md, not from the code: every visit of a mark and every line is a row in the
+Written from method.md, not from the code: every visit of a mark and every line is a row in the
 stage frame, every unknown a column, every size a row b / size. The columns are differences of what
 the whole model predicts, so that plates that turn by finite angles have theirs, too.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A measurement on a lattice as one dense least squares: sites and marks by their places.
 
-Written from the model in docs/method.md (eqs. 2.4, 2.6) for sides of any number of marks: the marks
+Written from the model in method.md (eqs. 2.4, 2.6) for sides of any number of marks: the marks
 of N rows lie at (i - (N-1)/2) pitches, i from 0. Sites are found by their places. Residuals are
 turned as the plate lies, with finite rotations, and are orthogonal to the columns of the linear
 model.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A machine cell written from the documentation alone: rclpy, the messages, numpy, own formulas.
 
-Nothing of selfcal_ros is imported. Signs are those of docs/cell.md: an indicated position is the
+Nothing of selfcal_ros is imported. Signs are those of cell.md: an indicated position is the
 true one plus the stage's error there; an offset is mark centre less optical axis, in stage axes.
 """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration and a later view of the same plate as one dense least squares.
 
-Written from docs/method.md, not from the code: two maps of the stage, one plate, one microscope,
+Written from method.md, not from the code: two maps of the stage, one plate, one microscope,
 misalignments of every view, linear in the rotations; all readings in one matrix, its pseudo-inverse
 the estimate.
 """

@@ -141,7 +141,8 @@ class SolverSettings(ManagedSettings):
     reference_certificate: str = declared("", "certificate of the known length: number, issuer")
     reference_at: str = declared(
         "", "temperatures for converting that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], "
-        "e.g. 20.4:0.05:0.5e-6:0.05e-6 (docs/certificate.md); empty = measured where it is used")
+        "e.g. 20.4:0.05:0.5e-6:0.05e-6 (docs/guides/certificate.md); empty = measured where it "
+        "is used")
     model_terms: list[str] = declared(
         [""], f"terms estimated with the map, each TERM or TERM:SIZE of {', '.join(BUILT_IN)}; the "
         f"size is a standard deviation, SI; 0 = exactly zero; empty = those of the plan; "
@@ -260,12 +261,12 @@ class DriverSettings(Settings):
 
     NODE: ClassVar[str] = "cell_driver"
     frame_id: str = _frame()
-    cell: str = declared("", "path of CELL.yaml (docs/machines.md)")
+    cell: str = declared("", "path of CELL.yaml (docs/start/machines.md)")
 
 
 @dataclass(frozen=True)
 class SimulatorSettings(Settings):
-    """The cell of stage_simulator, by the keys of SIM.yaml (docs/simulate.md)."""
+    """The cell of stage_simulator, by the keys of SIM.yaml (docs/guides/simulate.md)."""
 
     NODE: ClassVar[str] = "stage_simulator"
     measurement_sense: str = _sense()
