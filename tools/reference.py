@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make reference`: the page of that name from code that reads and writes what it describes."""
 
-import re
 import sys
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,16 @@ from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_text
 from selfcal_ros.simulation import spec
-from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.simulation.machine import Spread
-from selfcal_ros.simulation.spec import Faults
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/reference/reference.md"
+SIMULATED = {*spec.PHYSICS, *spec.NOISE, *spec.CELL, "encoder", "rotation"}
+"""Parameters of stage_simulator that are keys of SIM.yaml."""
 HEAD = """# Reference
 
-Keys of PLAN.yaml, SIM.yaml and RESULT.json, parameters of the nodes, messages. Written by
-`make reference` from the code; a test keeps it current. SI units; the unit of each number is
-stated.
+For looking up: keys of PLAN.yaml and RESULT.json, parameters of the nodes, where the messages are
+described. Keys of SIM.yaml: [simulate.md](../guides/simulate.md). SI units. `make reference` writes
+this page.
 """
 PLAN = {
     "plan_id": "name of the plan; a plan has one plate",
@@ -173,21 +172,6 @@ def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[s
     return [(f"`{key}`", words[key]) for key in keys]
 
 
-def sim_rows() -> Iterator[tuple[str, ...]]:
-    for p in spec.TOP:
-        default = "from `seed`" if p.name == "noise_seed" else value(p.default)
-        yield f"`{p.name}`", default, bounds(vars(p)), p.unit
-    yield "`plan`", "", "a path relative to the file, or a plan", ""
-    yield "`placed`", "none", "views as in a plan, with another pose of the plate", ""
-    for name, section, defaults in (
-            ("truth", spec.TRUTH, Spread()), ("physics", spec.PHYSICS, Spread()),
-            ("noise", spec.NOISE, CellSettings()), ("cell", spec.CELL, CellSettings()),
-            ("faults", spec.FAULTS, Faults())):
-        for key, p in section.items():
-            default = getattr(defaults, spec.field_of(key, type(defaults)))
-            yield f"`{name}.{key}`", value(default), bounds(vars(p)), p.unit
-
-
 def value(item: Any) -> str:
     if isinstance(item, bool):
         return str(item).lower()
@@ -202,19 +186,17 @@ def bounds(limits: dict[str, Any]) -> str:
 
 
 def parameter_row(p: Parameter) -> tuple[str, ...]:
-    return f"`{p.name}`", value(p.default), bounds(vars(p)), p.unit, p.description
+    allowed = f"({bounds(vars(p))})" if bounds(vars(p)) else ""
+    return f"`{p.name}`", " ".join(filter(None, (value(p.default), p.unit, allowed))), p.description
 
 
-def message_lines(path: Path) -> list[str]:
-    """Return the table of a message, service or action; its parts are divided by a row."""
-    rows = []
-    for line in path.read_text().splitlines():
-        found = re.match(r"([a-z]\S*)\s+(\w+(?:=\S+)?(?: \d+)?)\s*(?:#\s*(.*))?$", line)
-        if found:
-            rows.append((f"`{found[2]}`", f"`{found[1]}`", found[3] or ""))
-        elif line == "---":
-            rows.append(("—", "", "(next part: answer or feedback)"))
-    return [f"### {path.stem}", "", *table(("field", "type", "meaning"), rows), ""]
+def message_rows() -> Iterator[tuple[str, ...]]:
+    """Yield each message, service and action with what its definition says at its beginning."""
+    for kind in ("msg", "srv", "action"):
+        for path in sorted((ROOT / "msg_defs" / kind).iterdir()):
+            about = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
+            words = " ".join(line.lstrip("# ") for line in about)
+            yield f"[{path.name}](../../{path.relative_to(ROOT)})", words
 
 
 def text(result: dict[str, Any]) -> str:
@@ -224,20 +206,23 @@ def text(result: dict[str, Any]) -> str:
         raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
     lines = [HEAD, "## PLAN.yaml", "",
              *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")), "",
-             "## SIM.yaml", "", "Meaning of the keys: docs/guides/simulate.md.", "",
-             *table(("key", "default", "allowed", "unit"), sim_rows()), "",
              "## RESULT.json", "", *table(("key", "meaning"), described(
                  list(result), RESULT, "RESULT.json")), "",
              "Present only if requested, or if there is something to report:", "",
              *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
              "## Parameters", ""]
     for node, parameters in NODE_PARAMETERS.items():
-        lines += [f"### {node}", "", *table(("parameter", "default", "allowed", "unit", "meaning"),
-                                            map(parameter_row, parameters)), ""]
-    lines += ["## Messages, services, action", ""]
-    for folder in ("msg", "srv", "action"):
-        for path in sorted((ROOT / "msg_defs" / folder).iterdir()):
-            lines += message_lines(path)
+        lines += [f"### {node}", ""]
+        if node == "stage_simulator":
+            lines += ["Also the keys of `physics`, `noise` and `cell` of SIM.yaml, without the "
+                      "name of their section, and `encoder` and `rotation` of its `truth`.", ""]
+            parameters = [p for p in parameters if p.name not in SIMULATED]
+        lines += [*table(("parameter", "default (allowed)", "meaning"),
+                         map(parameter_row, parameters)), ""]
+    lines += ["## Messages, services, action", "",
+              "Each field has its unit and frame in the definition; `ros2 interface show "
+              "selfcal_msgs/msg/ErrorMap` prints it.", "",
+              *table(("definition", "what"), message_rows())]
     return "\n".join(lines).rstrip() + "\n"
 
 

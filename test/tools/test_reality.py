@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cases of `make reality`: how the plates lie, and how a result is compared with the truth."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
 from test.support.truth import simulate_measurements
-from tools.reality.__main__ import BEGIN, END, write_table
+from tools.reality.__main__ import BEGIN, END, table, write_table
 from tools.reality.cases import (
     MODEL,
     Case,
@@ -26,6 +27,7 @@ from tools.reality.machines import laid
 from tools.reality.runs import (
     Course,
     Run,
+    Summary,
     compared,
     every_case,
     limit,
@@ -230,3 +232,17 @@ def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
     case, = (c for c in every_case() if c.name.startswith("encoders with 20 nm of noise"))
     first = run_case(case, seed).first
     assert first.holds or first.grade == "not_qualified"
+
+
+def test_the_table_has_a_line_a_case_and_lists_those_without_a_map():
+    first = Summary(40, {"good": 1, "enlarged": 39}, 2, (3, 7), 2e-8, within=0.97, u_within=0.0035,
+                    within_x=0.96, within_y=0.98, within_theta=math.nan, z_xy=0.889,
+                    z_theta=math.nan, causes=(("microscope", 39), ("drift", 1)))
+    advised = replace(first, grades={"good": 40}, wrong=0)
+    refused = replace(first, grades={"refused": 40})
+    text = table([("scale, 3 urad", [first, advised]), ("turned", [refused]), ("bent", [first])])
+    assert text[1:] == [
+        "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |",
+        "| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) |  | microscope |",
+        "", "No map in any run: turned."]
+    assert text[0].count("|") == 2 * text[1].count("|")

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.parallel import check_workers, outcomes
-from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| effect | runs | largest error, nm (median) | in U: XY (x, y), θ | "
-          "error / u: XY, θ | good | enlarged | not qualified | refused | wrong and accepted | "
-          "first cause |\n|---|---|---|---|---|---|---|---|---|---|---|")
+HEADER = ("| effect | in U: XY, θ, % | error / u: XY, θ | grades (wrong) | after the advice | "
+          "first cause |\n|---|---|---|---|---|---|")
+REFUSED = "No map in any run"
+"""How the list of the cases without a map begins."""
 
 SHOWN = {
     "plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad",
@@ -35,17 +35,39 @@ SHOWN = {
 """Text of a case's name -> how the table shows it. Seeds depend on the name itself."""
 
 
-def row(name: str, found: Summary) -> str:
-    causes = ", ".join(f"{cause} ({count})" for cause, count in found.causes) or "–"
-    for plain_text, shown in SHOWN.items():
-        name = name.replace(plain_text, shown)
-    grades = " | ".join(str(found.grades.get(grade, 0)) for grade in GRADES)
-    seeds = f" (seeds {', '.join(map(str, found.wrong_seeds[:5]))})" if found.wrong else ""
-    text = (f"| {name} | {found.runs} | {found.error_m * NM_PER_M:.3g} | "
-            f"{100 * found.within:.1f} ± {200 * found.u_within:.1f} % ({100 * found.within_x:.1f}, "
-            f"{100 * found.within_y:.1f} %), {100 * found.within_theta:.1f} % | {found.z_xy:.2f}, "
-            f"{found.z_theta:.2f} | {grades} | {found.wrong}{seeds} | {causes} |")
-    return text.replace("nan ± nan % (nan, nan %)", "–").replace("nan %", "–").replace("nan", "–")
+def shown(name: str) -> str:
+    for plain_text, text in SHOWN.items():
+        name = name.replace(plain_text, text)
+    return name
+
+
+def grades(found: Summary) -> str:
+    counts = "/".join(str(found.grades.get(grade, 0)) for grade in GRADES)
+    return f"{counts} ({found.wrong})"
+
+
+def row(name: str, found: Summary, advised: Summary | None) -> str:
+    """Return the line of a case; `advised` is what came of it where advice was followed."""
+    within_xy = f"{100 * found.within:.1f} ± {200 * found.u_within:.1f}"
+    within_theta = f"{100 * found.within_theta:.1f}"
+    cause = found.causes[0][0] if found.causes else "–"
+    after = grades(advised) if advised else ""
+    text = (f"| {shown(name)} | {within_xy}, {within_theta} | "
+            f"{found.z_xy:.2f}, {found.z_theta:.2f} | {grades(found)} | {after} | {cause} |")
+    return text.replace("nan ± nan", "–").replace("nan", "–")
+
+
+def table(cases: list[tuple[str, list[Summary]]]) -> list[str]:
+    """Return the page's table: a row for each case, then the cases that gave no map at all."""
+    lines, refused = [HEADER], []
+    for name, (found, *advised) in cases:
+        if found.grades.get("refused") == found.runs:
+            refused.append(shown(name))
+        else:
+            lines.append(row(name, found, advised[0] if advised else None))
+    if refused:
+        lines += ["", f"{REFUSED}: {'; '.join(refused)}."]
+    return lines
 
 
 def main() -> int:
@@ -68,17 +90,17 @@ def main() -> int:
         return 0
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
-    lines, done = [HEADER], []
-    print("\n".join(lines), flush=True)
+    cases: list[tuple[str, list[Summary]]] = []
+    done = []
     for index, courses in finished(jobs, check_workers(args.workers)):
         case = every[index]
         done.append(as_json(case, courses))
-        lines += [row(name, summary) for name, summary in rows(case, courses)]
-        print("\n".join(lines[-len(done[-1]["rows"]):]), flush=True)
+        cases.append((case.name, [summary for _, summary in rows(case, courses)]))
+        print("\n".join(table(cases[-1:])[1:]), flush=True)
         if args.output and args.output.endswith(".json"):
             write_json(args.output, plain(done))  # kept if the rest is interrupted
         elif args.output:
-            write_table(args.output, lines)
+            write_table(args.output, table(cases))
     return 0
 
 
