@@ -108,7 +108,8 @@ RESULT = {
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
                 "size, u, unit, p, details (by name, SI units)",
     "digest": "key -> the first 64 bits of the SHA-256 of its value, without the time of creation: "
-              "a key that was edited is refused by name; a file without `digest` is accepted",
+              "a key that was edited is refused by name, a file without `digest` too; one of a "
+              "version before 0.4.0, which wrote none, is not qualified",
     "excluded": "effects outside U, as lines of `budget` with the source `excluded`: `u` is a "
                 "nominal size, `effect_rms`, `effect_max` what it would add to u of the XY map",
     "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "

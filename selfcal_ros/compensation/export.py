@@ -153,7 +153,7 @@ def verdict_lines(result: CalibrationResult) -> list[str]:
     if verdict.grade is Grade.ENLARGED:
         return [*lines, "verdict: good within an enlarged uncertainty",
                 *(f"because: {reason}" for reason in verdict.reasons)]
-    return [*lines, "verdict: NOT QUALIFIED, the readings contradict the model",
+    return [*lines, "verdict: NOT QUALIFIED",
             *(f"because: {reason}" for reason in verdict.reasons)]
 
 

@@ -4,6 +4,7 @@
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
@@ -43,6 +45,8 @@ from selfcal_ros.outputs import plain
 SCHEMA = "selfcal.result/1"
 DIGEST = "digest"
 """Key of the digests of the other keys."""
+WITHOUT_DIGESTS = re.compile(r"(0\.[0-3]\..*)?")
+"""Versions that wrote no digests; the first results had no version."""
 COMBINED = "combined"
 """Method of a mean of several results, and key of the runs behind it."""
 LARGEST = 1e3
@@ -253,6 +257,7 @@ def unidentified_result(measurements: Measurements, observability: Observability
         ArtifactMap(plate, plate, circle), views, observability, Noise(nan, nan),
         measurements.all_rejected(), sense=str(measurements.sense),
         verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
+        provenance=Provenance(version=__version__),
         run_id=measurements.run_id,
         placed_plate=artifact if artifact.map_grid else None)
 
@@ -332,24 +337,30 @@ def digests_of(data: dict[str, Any]) -> dict[str, str]:
     return found
 
 
-def require_unchanged(data: dict[str, Any], where: str) -> None:
-    """Refuse a JSON form that was changed after it was written; one without digests is accepted.
+def require_unchanged(data: dict[str, Any], where: str) -> bool:
+    """Refuse a JSON form that was changed after it was written.
+
+    Returns
+    -------
+    bool
+        Whether it could be checked: not if it is of a version that wrote no digests.
 
     Raises
     ------
     InputError
-        If a key does not have its digest; the message names the key.
+        If the digests are missing, or a key does not have its own; the message names the key.
     """
-    written = data.get(DIGEST)
-    if written is None:
-        return
-    now = digests_of(data)
+    now, written = digests_of(data), data.get(DIGEST)
+    version = (data.get("provenance") or {}).get("version") or ""
+    if written is None and WITHOUT_DIGESTS.fullmatch(str(version)):
+        return False
+    remedy = "write it again with the verb that made it, such as `selfcal solve`"
     if not isinstance(written, dict):
-        written = {}
+        raise InputError(where, f"its {DIGEST!r} was removed after the file was written", remedy)
     for key in (*now, *written):
         if now.get(key) != written.get(key):
-            raise InputError(where, f"its {key!r} was changed after the file was written",
-                             "write it again with the verb that made it, such as `selfcal solve`")
+            raise InputError(where, f"its {key!r} was changed after the file was written", remedy)
+    return True
 
 
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")

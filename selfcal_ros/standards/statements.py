@@ -19,7 +19,7 @@ EXPANDED = ("Each U is the expanded measurement uncertainty after JCGM 100:2008 
             "probability of 95.45 %.")
 SCOPE = ("The results relate only to the item calibrated, as it was and under the conditions "
          "stated here.")
-INVALID = "No statement of the uncertainty is valid: the readings contradict the model."
+INVALID = "No statement of the uncertainty is valid: the result is not qualified."
 
 
 def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import read_json
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.result import result_from_dict, result_to_dict
+from selfcal_ros.model.result import result_from_dict, result_to_dict, with_digests
 from selfcal_ros.model.verdict import Enlargement, Grade, Verdict
 from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.figures import maps, paper
@@ -130,14 +130,12 @@ def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files
     data = read_json(files[1])
     data["error_map"]["gy"][2][3] += 1e-6
     other = str(tmp_path / "other.json")
-    data.pop("digest", None)
-    write_json(other, data)
+    write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "verdict: significant, the maps differ in XY"
     for key in ("u_gx", "u_gy", "u_g_theta"):
         data["error_map"][key] = plain(np.array(data["error_map"][key], dtype=float) * np.nan)
-    data.pop("digest", None)
-    write_json(other, data)
+    write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
         "verdict: none, no uncertainties to test against")
@@ -149,8 +147,7 @@ def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
     data["verdict"] |= {
         "qualified": False, "grade": "not_qualified", "sentence": "Not qualified: because"}
     bad, laser = str(tmp_path / "bad.json"), str(tmp_path / "laser.json")
-    data.pop("digest", None)
-    write_json(bad, data)
+    write_json(bad, with_digests(data))
     write_json(laser, {"ex_x": [], "error_map_equivalent": {
         "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": None,
         "u_scale_difference": None}})
@@ -165,8 +162,7 @@ def test_different_theta_datums_are_said(files, tmp_path, capsys):
     data = read_json(files[1])
     data["error_map"]["datum_theta"] = "xy_axes"
     other = str(tmp_path / "other.json")
-    data.pop("digest", None)
-    write_json(other, data)
+    write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
     assert "theta datums differ: zero_mean and xy_axes" in capsys.readouterr().out
     assert main(["diff", *files]) == 0
@@ -183,8 +179,7 @@ def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
                                    + error * 0.01 * np.arange(-2, 3)).tolist()
         if error:
             data["reference"] = {"kind": "artifact", "relative_error": error, "u_relative": 1e-7}
-        data.pop("digest", None)
-        write_json(files[number], data)
+        write_json(files[number], with_digests(data))
     assert main(["diff", *files]) == 0
     assert "scale +50 µm/m" in capsys.readouterr().out
     for pair, bare in ((files, files[0]), (files[::-1], files[0])):
@@ -201,8 +196,7 @@ def test_another_lattice_is_bad_input(files, tmp_path, capsys):
     data = read_json(files[1])
     data["artifact"]["grid_pitch"] = 0.02
     other = tmp_path / "other.json"
-    data.pop("digest", None)
-    write_json(other, data)
+    write_json(other, with_digests(data))
     assert main(["diff", files[0], str(other)]) == 2
     error = capsys.readouterr().err
     assert "the lattices differ: pitches of 10 and 20 mm" in error

@@ -229,9 +229,27 @@ def test_layout_and_time_of_creation_are_no_edits(tmp_path):
     assert_same(read_result(path), before)
 
 
-def test_a_file_without_digests_is_read(tmp_path):
-    """It comes from an older version, or from another program."""
+@pytest.mark.parametrize("version", ["0.4.0", "0.10.0", "1.0.0", "unknown"])
+@pytest.mark.parametrize("remove", [lambda data: data.pop("digest"),
+                                    lambda data: data.__setitem__("digest", "none")])
+def test_a_file_whose_digests_were_removed_is_refused(version, remove, tmp_path):
+    path = written_file(tmp_path)
+    edited(path, lambda data: data["provenance"].__setitem__("version", version))
+    edited(path, remove)
+    with pytest.raises(InputError, match=r"r\.json: its 'digest' was removed"):
+        read_result(path)
+
+
+@pytest.mark.parametrize("older", [
+    lambda data: data["provenance"].__setitem__("version", "0.1.0"),
+    lambda data: data["provenance"].__setitem__("version", "0.3.11"),
+    lambda data: data["provenance"].pop("version"), lambda data: data.pop("provenance")])
+def test_a_file_of_a_version_without_digests_is_not_qualified(older, tmp_path):
     path = written_file(tmp_path)
     before = read_result(path)
-    edited(path, lambda data: data.pop("digest"))
-    assert_same(read_result(path), before)
+    edited(path, lambda data: (data.pop("digest"), older(data)))
+    found = read_result(path)
+    assert before.verdict.qualified and not found.verdict.qualified
+    assert found.verdict.reasons[0] == (
+        "the file has no digests, so whether it was edited cannot be checked")
+    np.testing.assert_array_equal(found.error_map.gx, before.error_map.gx)
