@@ -170,20 +170,26 @@ def read_header(kind: Kind, heads: list[tuple[int, str]], findings: CalFindings)
     header = Header(kind, heads[0][0])
     for index, (line, text) in enumerate(heads):
         words: list[str] = []
-        at = 0
+        at, named, late = 0, False, False
         text = text.rstrip(" \t")
         while at < len(text):
             match = _WORD.match(text, at)
             assert match is not None, "the pattern takes any text"
             at = match.end()
+            positional = bool(_POSITION.match(match["word"] or ""))
+            late |= positional and named
+            named |= not positional
             if match["key"]:
                 if match["blank"] or match["blank2"]:
                     findings.tolerated(line, "blanks around =", "write KEYWORD=argument")
                 _argument(header, (line, match["key"]), match["value"], findings)
-            elif _POSITION.match(match["word"]):
+            elif positional:
                 words.append(match["word"])
             else:
                 _flag(header, line, match["word"], findings)
+        if late and index == 0:
+            findings.tolerated(line, f"an argument of {kind.start} after a keyword",
+                               f"write {', '.join(POSITIONAL[kind])} before the keywords")
         _positional(header, (index, line), words, findings)
     return header
 

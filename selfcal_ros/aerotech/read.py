@@ -4,6 +4,7 @@
 import contextlib
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -324,3 +325,21 @@ def refuse_errors(cal: model.CalFile) -> model.CalFile:
 def load_cal(path: str | os.PathLike) -> model.CalFile:
     """Return a calibration file that a controller would accept; InputError for any other."""
     return refuse_errors(read_cal(path))
+
+
+def load_cals(paths: Sequence[str]) -> model.CalFile:
+    """Return files that are loaded together as one; their corrections are added.
+
+    Raises
+    ------
+    InputError
+        As `load_cal`; or if a file is named twice.
+    """
+    twice = next((path for number, path in enumerate(paths) for other in paths[:number]
+                  if os.path.realpath(path) == os.path.realpath(other)), None)
+    if twice is not None:
+        raise InputError(twice, "is named twice, which would add it twice", "name it once")
+    files = [load_cal(path) for path in paths]
+    return model.CalFile(", ".join(paths), *(
+        tuple(item for cal in files for item in getattr(cal, name))
+        for name in ("tables", "findings", "comments")))

@@ -13,7 +13,7 @@ from typing import Any
 from selfcal_ros.aerotech import export
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
-from selfcal_ros.aerotech.read import load_cal, parse_cal, read_cal, refuse_errors
+from selfcal_ros.aerotech.read import load_cal, load_cals, parse_cal, read_cal, refuse_errors
 from selfcal_ros.aerotech.rules import Gi4
 from selfcal_ros.aerotech.verify import (
     controller_figure,
@@ -72,7 +72,8 @@ def add_files(group: argparse._SubParsersAction) -> None:
     check.set_defaults(run_sub_verb=_check)
     evaluate = group.add_parser("eval", help="print the corrections at a position as JSON, "
                                              "in primary units by axis")
-    evaluate.add_argument("file", metavar="FILE.cal")
+    evaluate.add_argument("files", metavar="FILE.cal", nargs="+", help="file, or several that are "
+                          "loaded together: their corrections are added")
     add = evaluate.add_argument
     add("--position", action="append", metavar="AXIS=P", help="position: primary units, or a "
         "length as in 1=10.5mm")
@@ -133,7 +134,7 @@ def _described(table: "Table1D | Table2D") -> dict:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    cal = load_cal(args.file)
+    cal = load_cals(args.files)
     frame = frame_from_comments(cal.comments)
     unit = args.unit or (frame.unit if frame else "mm")
     rotary = {axis for table in cal.tables if getattr(table, "rollover", None)
@@ -189,7 +190,8 @@ def add_maps(group: argparse._SubParsersAction) -> None:
     verify = group.add_parser("verify", help="print the residual of a simulated controller before "
                                              "and after a file is loaded, um")
     verify.add_argument("result", metavar="RESULT.json")
-    verify.add_argument("file", metavar="FILE.cal")
+    verify.add_argument("files", metavar="FILE.cal", nargs="+", help="file, or several that are "
+                        "loaded together")
     verify.add_argument("--onto", metavar="ACTIVE.cal",
                         help="table that was loaded during the calibration")
     verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
@@ -287,7 +289,7 @@ def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | No
 
 
 def _verify(args: argparse.Namespace) -> int:
-    result, cal = read_result(args.result), load_cal(args.file)
+    result, cal = read_result(args.result), load_cals(args.files)
     frame = cal_lines.frame_of(args, frame_of_file(cal))
     with busy("simulating the controller"):
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
@@ -296,7 +298,7 @@ def _verify(args: argparse.Namespace) -> int:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
         save_picture(controller_figure(found), args.plot)
     if found.worse:
-        raise InputError(args.file, "the tables make the machine worse",
+        raise InputError(cal.where, "the tables make the machine worse",
                          "check signs, axes, unit, home position and encoder directions")
     return int(ExitCode.DONE)
 

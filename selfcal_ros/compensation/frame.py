@@ -4,7 +4,7 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,10 +118,29 @@ class MachineFrame:
 
 
 def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
-    """Return the frame that `MachineFrame.comment` wrote into a file, or None."""
-    line = next((c for c in comments if c.startswith(_MARK)), None)
-    if line is None:
-        return None
+    """Return the frame that `MachineFrame.comment` wrote into a file, or several, or None.
+
+    Raises
+    ------
+    InputError
+        If they state different frames; one may be without theta.
+    """
+    stated = [frame for line in comments if line.startswith(_MARK) and (frame := _stated(line))]
+    whole = max(stated, key=lambda frame: frame.theta_axis is not None, default=None)
+    for frame in stated:
+        if whole is not None and frame not in (whole, _plane(whole)):
+            raise InputError("comments", f"the tables are for different axes, '{frame.comment()}' "
+                             f"and '{whole.comment()}'", "write them with the same options")
+    return whole
+
+
+def _plane(frame: MachineFrame) -> MachineFrame:
+    """Return a frame without its theta axis."""
+    return replace(frame, theta_axis=None, home_theta_rad=0.0, reverse_theta=False,
+                   theta_counts_per_unit=None)
+
+
+def _stated(line: str) -> MachineFrame | None:
     words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK):]))
     try:
         unit_m = LENGTHS_M[words.get("unit", "mm")]

@@ -125,6 +125,11 @@ WILD = [
     (STRICT_1D.replace('"', "").replace(";3'4", ""), (3, "a serial number without quotes")),
     (":START 1 SAMPLEDIST=1 PRIMARYABSOLUTEFEEDBACKOFFSET=5\n0\n:END\n",
      (1, "the keyword 'PRIMARYABSOLUTEFEEDBACKOFFSET'")),
+    (":START SAMPLEDIST=1 2\n0\n:END\n", (1, "an argument of :START after a keyword")),
+    (":START NEGPOS 2\n:START SAMPLEDIST=1\n0\n:END\n",
+     (1, "an argument of :START after a keyword")),
+    (STRICT_2D.replace("2 1 1 2 10 20 3", "2 1 1 2 OUTAXIS3=3 10 20 2"),
+     (1, "an argument of :START2D after a keyword")),
     (":START 1 SAMPLEDIST=1 HOMEOFFSET=0 HOMEDIRECTION=cw\n0\n:END\n",
      (1, "a home direction in lower case")),
 ]

@@ -172,6 +172,33 @@ def test_results_that_cannot_be_exported(run):
     one_line(err, "its non-orthogonality is not known")
 
 
+def test_files_that_are_loaded_together_are_added(run, tmp_path):
+    for number, values in enumerate(("0 2 5", "0 -1 1")):
+        (tmp_path / f"{number}.cal").write_text(
+            f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n")
+    code, out, _ = run("eval", "0.cal", "1.cal", "--position", "1=15")
+    assert code == 0 and json.loads(out) == {"1": (2 + 5) / 2 + (-1 + 1) / 2}
+    code, out, err = run("eval", "0.cal", "1.cal", "./0.cal", "--position", "1=15")
+    assert (code, out) == (2, "")
+    one_line(err, "./0.cal: is named twice")
+
+
+def test_verify_loads_all_files(run):
+    wiring = "--x-axis", "2", "--y-axis", "1", "--theta-axis", "3"
+    run("export", "r.json", "-o", "f.cal", *wiring, "--counts-per-unit", "3=1000")
+    both = json.loads(run("verify", "r.json", "f.cal", "f_theta.cal", "--json")[1])
+    assert list(both) == ["sites", "between", "lines"]
+    assert all(both[place]["after"]["rms"] < 1e-2 * both[place]["before"]["rms"]
+               for place in ("sites", "lines"))
+    run("accuracy", "r.json", "--along", "x", "-o", "x.cal", *wiring[:4])
+    twice = json.loads(run("verify", "r.json", "f.cal", "x.cal", "--json")[1])
+    assert twice["sites"]["after"]["rms"] > 1e2 * both["sites"]["after"]["rms"]
+    run("accuracy", "r.json", "--along", "x", "-o", "other.cal", *wiring[:4], "--home-x", "5")
+    code, _, err = run("verify", "r.json", "f.cal", "other.cal")
+    assert code == 2
+    one_line(err, "the tables are for different axes, 'machine: x-axis=2 y-axis=1 unit=mm home-x=5")
+
+
 @pytest.mark.parametrize("verb", ["export", "orthogonality", "accuracy", "straightness"])
 def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb):
     why = "the plate slipped: measure it again"
