@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.simulation.machine import random_truth
 from test.support.truth import simulate_measurements
-from tools.reality.__main__ import BEGIN, END, table, write_table
+from tools.reality.__main__ import BEGIN, COLUMNS, END, record, row, table, write_table
 from tools.reality.cases import (
     MODEL,
     Case,
@@ -234,15 +234,27 @@ def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
     assert first.holds or first.grade == "not_qualified"
 
 
-def test_the_table_has_a_line_a_case_and_lists_those_without_a_map():
+def test_the_page_lists_the_cases_with_more_wrong_runs_than_one_in_twenty():
     first = Summary(40, {"good": 1, "enlarged": 39}, 2, (3, 7), 2e-8, within=0.97, u_within=0.0035,
                     within_x=0.96, within_y=0.98, within_theta=math.nan, z_xy=0.889,
                     z_theta=math.nan, causes=(("microscope", 39), ("drift", 1)))
     advised = replace(first, grades={"good": 40}, wrong=0)
-    refused = replace(first, grades={"refused": 40})
-    text = table([("scale, 3 urad", [first, advised]), ("turned", [refused]), ("bent", [first])])
-    assert text[1:] == [
-        "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |",
-        "| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) |  | microscope |",
-        "", "No map in any run: turned."]
+    text = table([("scale, 3 urad", [first, advised]), ("turned", [replace(first, wrong=0)]),
+                  ("bent", [replace(first, wrong=3)])])
+    assert text[1:] == ["| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (3) |  | microscope |"]
     assert text[0].count("|") == 2 * text[1].count("|")
+    assert row("scale, 3 urad", first, advised) == (
+        "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |")
+
+
+def test_the_record_has_each_case_at_first_and_after_the_advice():
+    bad = Run("enlarged", 3e-8, within=0.5, within_theta=math.nan, z_xy=2.0, holds=False,
+              causes=("drift",))
+    courses = {0: Course(bad, ("--model drift",), Run("good", 1e-8, within=1.0)), 1: Course(bad)}
+    first, advised = (dict(zip(COLUMNS, line, strict=True))
+                      for line in record(Case("bent by 3 urad"), courses))
+    assert (first["effect"], first["runs"]) == ("bent by 3 µrad", "2")
+    assert first["largest_error_nm"] == "30"
+    assert (first["in_u_xy"], first["in_u_theta"], first["enlarged"]) == ("50", "", "2")
+    assert (first["wrong"], first["first_cause"], first["runs_of_cause"]) == ("2", "drift", "2")
+    assert (advised["after_advice"], advised["good"], advised["wrong"]) == ("1", "1", "1")

@@ -5,19 +5,27 @@ python -m tools.reality [--runs N] [--first SEED] [--workers N] [--only TEXT] [-
 """
 
 import argparse
+import csv
+import math
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict
+from io import StringIO
 from pathlib import Path
 
 from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.parallel import check_workers, outcomes
+from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
 HEADER = ("| effect | in U: XY, θ, % | error / u: XY, θ | grades (wrong) | after the advice | "
           "first cause |\n|---|---|---|---|---|---|")
-REFUSED = "No map in any run"
-"""How the list of the cases without a map begins."""
+COLUMNS = ("effect", "after_advice", "runs", "largest_error_nm", "in_u_xy", "u_in_u_xy", "in_u_x",
+           "in_u_y", "in_u_theta", "error_over_u_xy", "error_over_u_theta", *GRADES, "wrong",
+           "first_cause", "runs_of_cause")
+WRONG = 0.05
+"""Part of the runs of a case that may be wrong and accepted; the page lists cases with more."""
 
 SHOWN = {
     "plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad",
@@ -46,7 +54,7 @@ def grades(found: Summary) -> str:
     return f"{counts} ({found.wrong})"
 
 
-def row(name: str, found: Summary, advised: Summary | None) -> str:
+def row(name: str, found: Summary, advised: Summary | None = None) -> str:
     """Return the line of a case; `advised` is what came of it where advice was followed."""
     within_xy = f"{100 * found.within:.1f} ± {200 * found.u_within:.1f}"
     within_theta = f"{100 * found.within_theta:.1f}"
@@ -58,16 +66,23 @@ def row(name: str, found: Summary, advised: Summary | None) -> str:
 
 
 def table(cases: list[tuple[str, list[Summary]]]) -> list[str]:
-    """Return the page's table: a row for each case, then the cases that gave no map at all."""
-    lines, refused = [HEADER], []
-    for name, (found, *advised) in cases:
-        if found.grades.get("refused") == found.runs:
-            refused.append(shown(name))
-        else:
-            lines.append(row(name, found, advised[0] if advised else None))
-    if refused:
-        lines += ["", f"{REFUSED}: {'; '.join(refused)}."]
-    return lines
+    """Return the page's table: the cases with more wrong and accepted runs than `WRONG`."""
+    return [HEADER, *(row(name, found, *advised)
+                      for name, (found, *advised) in cases if found.wrong > WRONG * found.runs)]
+
+
+def record(case: Case, courses: dict[int, Course]) -> Iterator[list[str]]:
+    """Yield the lines of a case for the table of all cases, of `COLUMNS`."""
+    followed = sum(bool(course.steps) for course in courses.values())
+    for (_, found), advised in zip(rows(case, courses), ("", str(followed)), strict=False):
+        numbers = (found.error_m * NM_PER_M, 100 * found.within, 200 * found.u_within,
+                   100 * found.within_x, 100 * found.within_y, 100 * found.within_theta,
+                   found.z_xy, found.z_theta)
+        cause, count = found.causes[0] if found.causes else ("", "")
+        yield [shown(case.name), advised, str(found.runs),
+               *(f"{number:.3g}" if math.isfinite(number) else "" for number in numbers),
+               *(str(found.grades.get(grade, 0)) for grade in GRADES), str(found.wrong),
+               cause, str(count)]
 
 
 def main() -> int:
@@ -79,8 +94,8 @@ def main() -> int:
     parser.add_argument("--only", action="append", help="only cases whose name contains this text; "
                         "may be given again for others")
     parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
-    parser.add_argument("-o", "--output", help="write the table to this file (between the "
-                        "marks of a page that has them), or every run if it ends in .json")
+    parser.add_argument("-o", "--output", help="write the table to this page, between its marks, "
+                        "and all cases to the .csv beside it; or every run to a .json")
     args = parser.parse_args()
     every = every_case()
     chosen = [i for i, case in enumerate(every)
@@ -91,17 +106,25 @@ def main() -> int:
     jobs = [(index, args.first + run) for index in chosen
             for run in range(args.runs * every[index].times)]
     cases: list[tuple[str, list[Summary]]] = []
-    done = []
+    lines, done = [list(COLUMNS)], []
     for index, courses in finished(jobs, check_workers(args.workers)):
         case = every[index]
         done.append(as_json(case, courses))
         cases.append((case.name, [summary for _, summary in rows(case, courses)]))
-        print("\n".join(table(cases[-1:])[1:]), flush=True)
+        lines += record(case, courses)
+        print(row(case.name, *cases[-1][1][:2]), flush=True)
         if args.output and args.output.endswith(".json"):
             write_json(args.output, plain(done))  # kept if the rest is interrupted
         elif args.output:
             write_table(args.output, table(cases))
+            write_text(Path(args.output).with_suffix(".csv"), in_csv(lines))
     return 0
+
+
+def in_csv(lines: list[list[str]]) -> str:
+    text = StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
 
 
 BEGIN, END = "<!-- rows -->\n", "\n<!-- end of rows -->"
