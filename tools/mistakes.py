@@ -74,7 +74,7 @@ MISTAKES = [Mistake(*row) for row in (
     ("solve bags/demo --sense plate", 2, "'plate' is unknown; "),
     ("solve bags/demo -o", 2, "-o/--output: expected one argument"),
     ("solve --output r.json", 2, "BAG is missing"),
-    ("plan", 2, "check|suggest.* is missing"),
+    ("plan", 2, "new|check|suggest.* is missing"),
     ("plan config/plans/hu.yaml", 2, "'config/plans/hu.yaml' is a file, and "),
     ("plan chek config/plans/hu.yaml", 2, "did you mean 'check'"),
     ("cal", 2, "WHAT is missing: one of "),

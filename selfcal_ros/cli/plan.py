@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``selfcal plan``: check a plan before anything moves, and suggest views."""
+"""``selfcal plan``: make a plan, check it before anything moves, and suggest views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from selfcal_ros.cli import plan_terms
+from selfcal_ros.cli import plan_new, plan_terms
 from selfcal_ros.cli.recheck import planned
 from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.collection.settings.estimator import read_plan
@@ -48,8 +48,10 @@ NODES_ONLY = ("every reading lies at a node of the map: to test the error betwee
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the sub-verbs ``check`` and ``suggest``."""
-    verbs = parser.add_subparsers(dest="plan_verb", metavar="check|suggest", required=True)
+    """Add the sub-verbs ``new``, ``check`` and ``suggest``."""
+    verbs = parser.add_subparsers(dest="plan_verb", metavar="new|check|suggest", required=True)
+    plan_new.configure(verbs.add_parser(
+        "new", help="write a plan and a CELL.yaml from what you know of stage, plate and time"))
     check = verbs.add_parser(
         "check", help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient")
     suggest = verbs.add_parser(
@@ -80,6 +82,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sub-verb and return its exit code."""
+    if args.plan_verb == "new":
+        return plan_new.run(args)
     plan = read_plan(args.plan)
     if plan.artifact_from:
         return planned(args, _repeated(plan, args.repeats if args.plan_verb == "check" else None))

@@ -37,7 +37,7 @@ def bag(tmp_path_factory):
     ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
     ("--version=3 solve", "selfcal: argument --version: ignored explicit argument '3'; see selfcal "
      "--help"),
-    ("plan", "selfcal plan: check|suggest is missing; see selfcal plan --help"),
+    ("plan", "selfcal plan: new|check|suggest is missing; see selfcal plan --help"),
     ("solve", "selfcal solve: BAG is missing; see selfcal solve --help"),
     ("solve b --methd joint", "selfcal solve: the option --methd is unknown; did you mean "
      "'--method'?; see selfcal solve --help"),
@@ -45,7 +45,7 @@ def bag(tmp_path_factory):
      "; see selfcal solve --help"),
     ("solve b --method qqq", "selfcal solve: --method: 'qqq' is unknown; known are joint, law; see "
      "selfcal solve --help"),
-    ("plan chek x", "selfcal plan: check|suggest 'chek' is unknown; did you mean 'check'?; see "
+    ("plan chek x", "selfcal plan: new|check|suggest 'chek' is unknown; did you mean 'check'?; see "
      "selfcal plan --help"),
     ("plan check p --sigmma=3", "selfcal plan check: the option --sigmma is unknown; did you mean "
      "'--sigma'?; see selfcal plan check --help"),
@@ -273,6 +273,7 @@ RUNS = {
     "apply": "apply R POINTS -o a.csv", "report": "report R", "plot": "plot R -o t.svg",
     "table": "table S -o t.csv", "combine": "combine S u.csv -o mean.json",
     "certificate": "certificate S DETAILS -o c.xml", "iso230": "iso230 S",
+    "plan new": "plan new -o n.yaml --travel 1m --marks 5 --pitch 1mm",
     "plan check": "plan check PLAN", "plate": "plate PLAN -o plate.svg",
     "plan suggest": "plan suggest PLAN", "simulate": "simulate SIM -o made",
     "reproduce": "reproduce hu --draws 2", "cal export": "cal export R -o f.cal",

@@ -10,7 +10,7 @@ import pytest
 
 @pytest.mark.parametrize(("line", "wanted"), [
     ("selfcal so", {"solve"}), ("selfcal cal", {"cal", "call"}),
-    ("selfcal plan ", {"check", "suggest"}),
+    ("selfcal plan ", {"new", "check", "suggest"}),
     ("selfcal solve --meth", {"--method"}), ("selfcal solve --method ", {"joint", "law"}),
     ("selfcal cal ev", {"eval"})])
 def test_words_are_completed(tmp_path, line, wanted):

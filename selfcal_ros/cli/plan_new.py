@@ -1,0 +1,413 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal plan new``: a plan and a cell from what a person knows of stage, plate and time."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros.cli.plan_terms import length_m
+from selfcal_ros.cli.terminal import add_json, late_progress, say
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.observability.plan_budget import PlanBudget, plan_budget
+from selfcal_ros.estimation.observability.plan_check import (
+    CHECK_MARKS,
+    CHECK_OFFSET_M,
+    check_plan,
+    describe_view,
+    predict_plan,
+)
+from selfcal_ros.estimation.observability.suggest import (
+    Against,
+    Suggestion,
+    best_plan,
+    rank_next,
+    score_plan,
+)
+from selfcal_ros.estimation.terms.planned import Assumed
+from selfcal_ros.files import write_yaml
+from selfcal_ros.machine.cell import PLACERS, SHIPPED
+from selfcal_ros.machine.visiting import stops
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
+from selfcal_ros.model.pose import Image
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import default_terms
+from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
+from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.units import MM_PER_M, UM_PER_M
+
+REPEATS = {1: "", 2: "there_and_back@plate", 4: "x_back_y_back@plate"}
+"""Measurements of a mark in a view -> the order of the visits that completes them."""
+MOST_VIEWS = 5
+"""Views of marks of the longest plan; a view of the lines comes on top."""
+PLACING_MIN = {"person": 5.0, "robot": 0.5}
+"""Minutes that a placing of the plate takes."""
+PIXELS_A_MARK = 12
+"""Pixels across a mark of the simulated camera."""
+OWN_KEYS = {
+    "gcode": "{port: /dev/ttyUSB0, dialect: grbl, camera: 0}",
+    "joint_trajectory": "{joints: [x, y], image: camera/image_raw}",
+    "micromanager": "{config: microscope.cfg}",
+    "ophyd": "{x: 'beamline:stage.x', y: 'beamline:stage.y', unit: mm, "
+             "detector: 'beamline:camera', image: image1.image}"}
+"""Machine -> its own keys in CELL.yaml, to be edited."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a person is asked, and the option that answers it.
+
+    `default` is the answer of an empty line; without one there is none.
+    """
+
+    name: str
+    text: str
+    read: Callable[[str, str], Any]
+    default: str = ""
+
+
+@dataclass(frozen=True)
+class Known:
+    """The answers; lengths in m, `seconds` of an exposure with its move."""
+
+    travel: tuple[float, float]
+    marks: tuple[int, int]
+    pitch: float
+    lines: int
+    field: tuple[float, float]
+    placing: str
+    minutes: float
+    seconds: float
+    machine: str
+
+
+def _length(text: str, option: str) -> float:
+    """Return a length with a unit, m."""
+    if text.strip()[-1:] != "m":
+        raise InputError(option, f"'{text}' has no unit", "write for example 10mm")
+    return length_m(text, option)
+
+
+def _lengths(text: str, option: str) -> tuple[float, float]:
+    """Return one or two lengths such as 100x80mm, m."""
+    x, _, y = text.partition("x")
+    unit = re.sub(r"[^a-zµ]", "", y)
+    return _length(x if x.strip()[-1:] == "m" else x + unit, option), _length(y or x, option)
+
+
+def _field(text: str, option: str) -> tuple[float, float]:
+    return (0.0, 0.0) if text == "none" else _lengths(text, option)
+
+
+def _counts(text: str, option: str) -> tuple[int, int]:
+    """Return one or two numbers such as 11x9."""
+    x, _, y = text.partition("x")
+    return _count(x, option), _count(y or x, option)
+
+
+def _count(text: str, option: str) -> int:
+    if not text.strip().isdecimal():
+        raise InputError(option, f"'{text}' is not a whole number", "give for example 11")
+    return int(text)
+
+
+def _positive(text: str, option: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(option, f"'{text}' is not a positive number", "give for example 60")
+    return value
+
+
+def _one_of(*words: str) -> Callable[[str, str], str]:
+    def read(text: str, option: str) -> str:
+        if text not in words:
+            raise InputError(option, f"'{text}' is not one of {', '.join(words)}", "name one")
+        return text
+
+    return read
+
+
+QUESTIONS = (
+    Question("travel", "travel of the stage, as in 120mm or 120x100mm", _lengths),
+    Question("marks", "marks along a side of the plate, as in 11 or 11x9", _counts),
+    Question("pitch", "distance between neighbouring marks, as in 10mm", _length),
+    Question("lines", "angular lines of the plate; 0 = none, or the stage does not turn", _count,
+             "0"),
+    Question("field", "what the camera sees at once, as in 25x20mm; none = one mark", _field,
+             "none"),
+    Question("placing", "who places the plate: person or robot", _one_of(*PLACERS), "person"),
+    Question("minutes", "minutes that the measurement may take", _positive, "60"),
+    Question("seconds", "seconds for a mark: move, come to rest, expose", _positive, "2"),
+    Question("machine", f"what is driven: {', '.join(SHIPPED)}", _one_of(*SHIPPED), "simulated"))
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options; in a terminal what is missing is asked."""
+    parser.description = (
+        "Writes a plan and a CELL.yaml to be completed, and says what the plan will determine and "
+        "how long it takes. In a terminal it asks; a script gives --travel, --marks and --pitch, "
+        "and what differs from the defaults.")
+    for question in QUESTIONS:
+        default = f" (default: {question.default})" if question.default else ""
+        parser.add_argument(f"--{question.name}", metavar=question.name.upper(),
+                            help=question.text + default)
+    parser.add_argument("-o", "--output", metavar="PLAN.yaml", required=True,
+                        help="plan to write; its name is that of the plan")
+    parser.add_argument("--cell", metavar="CELL.yaml",
+                        help="cell to write (default: cell.yaml beside the plan)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask, plan, write and say what the plan will determine."""
+    path = Path(args.output)
+    cell_path = Path(args.cell) if args.cell else path.with_name("cell.yaml")
+    simulation = cell_path.with_name(f"{cell_path.stem}_simulation.yaml")
+    known = _answers(args)
+    simulated = known.machine == "simulated"
+    outputs = [path, cell_path, *([simulation] if simulated else [])]
+    check_outputs([], outputs)
+    for written in outputs:
+        if written.exists():
+            raise InputError(str(written), "exists already", "remove it or name another file")
+    artifact = _artifact(known)
+    _require_travel(known, artifact)
+    with late_progress("judging plans") as progress:
+        plan = _best(known, artifact, path.stem, lambda: progress(0, None))
+        budget = _budget(plan)
+        step = _next(plan)
+    write_yaml(path, plan_to_dict(plan))
+    write_text(cell_path, _cell_text(known, simulation.name))
+    if simulated:
+        folder = path.resolve().parent
+        named = path.name if folder == simulation.resolve().parent else str(path.resolve())
+        write_yaml(simulation, _simulation(known, named))
+    say(args, "\n".join(_text(known, plan, (budget, step), outputs)),
+        _json(known, plan, (budget, step), outputs))
+    return int(ExitCode.DONE)
+
+
+def _answers(args: argparse.Namespace) -> Known:
+    """Return the answers from the options, and from a person where some are missing."""
+    missing = [item for item in QUESTIONS if not item.default and getattr(args, item.name) is None]
+    asks = bool(missing) and sys.stdin.isatty()
+    if missing and not asks:
+        raise InputError(f"--{missing[0].name}", "is missing, and there is nobody to ask: stdin is "
+                         "not a terminal", f"give the {missing[0].text}")
+    values: dict[str, Any] = {}
+    for item in QUESTIONS:
+        given = getattr(args, item.name)
+        if given is None and asks:
+            values[item.name] = _asked(item)
+        else:
+            text = item.default if given is None else given
+            values[item.name] = item.read(text, f"--{item.name}")
+    return Known(**values)
+
+
+def _asked(item: Question) -> Any:
+    """Ask until the answer can be read."""
+    while True:
+        default = f" [{item.default}]" if item.default else ""
+        print(f"{item.text}{default}: ", end="", file=sys.stderr, flush=True)
+        try:
+            text = input().strip() or item.default
+        except EOFError:
+            raise KeyboardInterrupt from None
+        try:
+            return item.read(text, item.name)
+        except InputError as error:
+            print(f"  {error}", file=sys.stderr)
+
+
+def _artifact(known: Known) -> Artifact:
+    nx, ny = known.marks
+    if known.lines and any(known.field):
+        raise InputError("--lines", "lines are not found in images, and a camera is given",
+                         "plan the lines apart, with --field none")
+    return Artifact(nx, known.pitch, known.lines, 0 if nx == ny else ny)
+
+
+def _require_travel(known: Known, artifact: Artifact) -> None:
+    """Refuse a plate that the stage cannot pass over."""
+    aside = _check_offset_m(artifact)
+    for axis, travel, count in zip("xy", known.travel, artifact.shape, strict=True):
+        span = (count - 1) * known.pitch + 2 * aside
+        if span > travel:
+            fits = int((travel - 2 * aside) / known.pitch) + 1
+            mend = f"take {fits} marks, or marks that are closer" if fits >= 3 else (
+                "take a plate whose marks are closer")
+            raise InputError("--travel", f"{travel * MM_PER_M:g} mm along {axis}, and {count} "
+                             f"marks with their check stops need {span * MM_PER_M:g} mm", mend)
+
+
+def _check_offset_m(artifact: Artifact) -> float:
+    return min(CHECK_OFFSET_M, MOST_CHECK_OFFSET * artifact.grid_pitch_m)
+
+
+def _image(known: Known) -> Image | None:
+    """Return the cells that the camera sees; None for a single mark."""
+    counts = []
+    for side, marks in zip(known.field, known.marks, strict=True):
+        shown = min(int(side / known.pitch * (1 + 1e-9)), marks)  # 0.6 mm are 3 pitches of 0.2 mm
+        counts.append(max(1, shown - 1 + shown % 2))
+    nx, ny = counts
+    return Image(nx, ny, known.pitch) if nx * ny > 1 else None
+
+
+def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
+    """Return the plan of the smallest uncertainty that the time allows."""
+    image = _image(known)
+    plans = []
+    for n_views in range(3, MOST_VIEWS + 1):
+        like = View("", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact),
+                    image=image)
+        views = best_plan(artifact, n_views + bool(known.lines), angular=bool(known.lines),
+                          like=like, against=_against())[0].views
+        plans += list(_repeated(Plan(name, artifact, views)))
+        tick()
+        if minutes_of(known, plans[-len(REPEATS)]) > known.minutes:
+            break
+    fitting = [plan for plan in plans if minutes_of(known, plan) <= known.minutes]
+    if not fitting:
+        raise InputError("--minutes", f"{known.minutes:g}, and the shortest plan takes "
+                         f"{math.ceil(minutes_of(known, plans[0]))}: "
+                         f"{_counted_visits(plans[0], known)}",
+                         "give more minutes, fewer marks, or fewer seconds for a mark")
+    return min(fitting, key=_u_of_reading)
+
+
+def _repeated(plan: Plan) -> Iterator[Plan]:
+    """Yield the plan with every number of repeats."""
+    for repeats, order in REPEATS.items():
+        yield replace(plan, views=tuple(
+            replace(view, repeats=repeats, visit_order=order if view.grid else "")
+            for view in plan.views))
+
+
+def _u_of_reading(plan: Plan) -> float:
+    """Return the predicted uncertainty, rms, in units of the noise of one reading."""
+    return score_plan(plan, against=_against()).rms_xy / math.sqrt(plan.views[0].repeats)
+
+
+def _against() -> Against:
+    return Against((), by_default=tuple(default_terms()))
+
+
+def _exposures(plan: Plan) -> int:
+    return sum(stop.exposures for view in plan.views
+               for stop in stops(plan.artifact, view, Sense.MICROSCOPE_MOVES))
+
+
+def minutes_of(known: Known, plan: Plan) -> float:
+    """Return the minutes that a plan takes."""
+    return (len(plan.views) * PLACING_MIN[known.placing]
+            + _exposures(plan) * known.seconds / 60)
+
+
+def _counted_visits(plan: Plan, known: Known) -> str:
+    return (f"{len(plan.views)} placings of {PLACING_MIN[known.placing]:g} minutes, "
+            f"{_exposures(plan)} exposures of {known.seconds:g} s")
+
+
+def _budget(plan: Plan) -> PlanBudget:
+    """Return the predicted budget, as of `selfcal plan check`."""
+    seen = check_plan(plan).observability
+    if not seen.identifiable:  # only a search that misses its aim
+        raise InputError("--marks", "no plan of these marks identifies the stage",
+                         "; ".join(seen.advice))
+    return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
+
+
+def _next(plan: Plan) -> Suggestion:
+    """Return the further view that helps most."""
+    _, ranked = rank_next(plan, against=_against())
+    return next(item for item in ranked if item.view is not None and item.repeat_of is None)
+
+
+def _cell_text(known: Known, simulation: str) -> str:
+    """Return CELL.yaml, the places to be edited named in comments."""
+    own = (f"{{simulation: {simulation}}}" if known.machine == "simulated" else
+           f"{OWN_KEYS[known.machine]}  # edit: docs/machines.md")
+    x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in known.travel)
+    theta = ", theta: [-7.0, 7.0]" if known.lines else ""
+    lines = ["# From `selfcal plan new`.", f"machine: {known.machine}", f"{known.machine}: {own}",
+             f"limits: {{x: {x}, y: {y}{theta}}}  # m, as the stage indicates; never left",
+             "origin: {x: 0.0, y: 0.0}  # what it indicates at the centre of the field, m",
+             "sense: microscope_moves  # plate_moves where the stage carries the plate"]
+    if any(known.field) or known.machine != "simulated":
+        size = _mark_size_m(known)
+        pixel = (f", pixel_size: {size / PIXELS_A_MARK:.6g}"
+                 if known.machine == "simulated" else "")
+        lines.append(f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
+                     "`selfcal cell try` finds pixel size, turn and mirror")
+    placing = "robot  # the simulation" if known.machine == "simulated" else known.placing
+    return "\n".join([*lines, "settle: {time: 0.0}  # s", f"placing: {placing}", ""])
+
+
+def _mark_size_m(known: Known) -> float:
+    return known.pitch / 5  # the default of `selfcal plate`
+
+
+def _simulation(known: Known, plan: str) -> dict[str, Any]:
+    """Return SIM.yaml of the simulated machine."""
+    out: dict[str, Any] = {"plan": plan, "seed": 1,
+                           "truth": {"t": min(3e-5, known.pitch / 20)},  # error of the placing
+                           "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6}}
+    if any(known.field):
+        pixel_m = _mark_size_m(known) / PIXELS_A_MARK
+        width, height = (round(side / pixel_m) for side in known.field)
+        out["camera"] = {"width": width, "height": height, "pixel_size": pixel_m,
+                         "mark_size": _mark_size_m(known)}
+    return out
+
+
+def _text(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
+          outputs: list[Path]) -> Iterator[str]:
+    (budget, step), artifact = found, plan.artifact
+    nx, ny = artifact.shape
+    span = " x ".join(f"{(count - 1) * known.pitch * MM_PER_M:g}" for count in artifact.shape)
+    travel = " x ".join(f"{side * MM_PER_M:g}" for side in known.travel)
+    yield (f"plan {plan.plan_id}: {nx} x {ny} marks, {known.lines or 'no'} angular lines; the map "
+           f"covers {span} of {travel} mm of travel")
+    for view in plan.views:
+        kind = "" if view.grid else ", lines only"
+        yield f"  {view.name}: {describe_view(view, artifact)}, {view.repeats} times{kind}"
+    noise = Assumed()
+    yield (f"it identifies the stage: U of XY {2 * budget.u_rms('xy') * UM_PER_M:.3g} µm (k = 2, "
+           f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
+           "shows where U comes from")
+    yield (f"it takes about {minutes_of(known, plan):.0f} minutes: {_counted_visits(plan, known)}")
+    longer = minutes_of(known, replace(plan, views=step.views)) - minutes_of(known, plan)
+    less = step.score.rms_xy / score_plan(plan, against=_against()).rms_xy
+    assert step.view is not None
+    yield (f"the further view that helps most: {describe_view(step.view, artifact)}; it makes U "
+           f"{1 - less:.0%} smaller and takes {longer:.0f} minutes more")
+    yield f"written: {', '.join(map(str, outputs))}"
+    tried = "" if known.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
+    yes = " --yes" if known.machine == "simulated" else ""
+    yield (f"next: selfcal plate {outputs[0]} -o plate.svg; {tried}"
+           f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}")
+
+
+def _json(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
+          outputs: list[Path]) -> dict[str, Any]:
+    budget, step = found
+    assert step.view is not None
+    theta = budget.u_rms("theta")
+    return {"plan_id": plan.plan_id, "written": list(map(str, outputs)),
+            "views": [view_to_dict(view, plan.artifact) for view in plan.views],
+            "minutes": minutes_of(known, plan), "exposures": _exposures(plan),
+            "U_xy": 2 * budget.u_rms("xy"), "U_theta": 2 * theta if known.lines else None,
+            "next_view": view_to_dict(step.view, plan.artifact)}

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``selfcal plan new``: what it writes is accepted by all that read plans, and true."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from selfcal_ros.cli.main import main
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.files import read_yaml
+from selfcal_ros.machine.cell import SHIPPED, read_cell
+from test.support.terminals import SELFCAL, in_terminal
+
+STAGE = ["--travel", "50mm", "--marks", "5", "--pitch", "10mm"]
+CAMERA = ["--travel", "2mm", "--marks", "3", "--pitch", "0.2mm", "--field", "0.6x0.3mm"]
+
+CELLS = Path(__file__).parents[2] / "config/cells"
+
+
+def new(*options):
+    return main(["plan", "new", "-o", "plan.yaml", *options])
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("options", [[*STAGE, "--lines", "8"], CAMERA], ids=["lines", "camera"])
+def test_its_plan_is_checked_drawn_and_measured(options, capsys):
+    assert new(*options, "--minutes", "26", "--json") == 0
+    promised = json.loads(capsys.readouterr().out)
+    assert main(["plan", "check", "plan.yaml", "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert promised["U_xy"] == pytest.approx(checked["budget"]["U_xy"])
+    assert main(["plate", "plan.yaml", "-o", "plate.svg"]) == 0
+    capsys.readouterr()
+    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["views"]) == len(promised["views"]) * (3 if options is CAMERA else 1)
+    assert all(view["rejected"] == 0 for view in result["views"])
+
+
+def test_a_camera_shows_an_odd_number_of_marks():
+    assert new(*CAMERA, "--minutes", "20") == 0
+    assert read_yaml("plan.yaml")["image"] == {"nx": 3, "ny": 1, "pitch_m": 2e-4}
+
+
+def test_the_time_is_kept_and_used(capsys):
+    """More time gives a smaller U; the exposures are counted by hand."""
+    found = {}
+    for minutes in ("20", "60"):
+        assert new(*STAGE, "--minutes", minutes, "--json") == 0
+        found[minutes] = json.loads(capsys.readouterr().out)
+        assert found[minutes]["minutes"] <= float(minutes)
+        for name in ("plan.yaml", "cell.yaml", "cell_simulation.yaml"):
+            Path(name).unlink()
+    assert found["60"]["U_xy"] < 0.8 * found["20"]["U_xy"]
+    views = found["20"]["views"]
+    marks = sum(view["repeats"] * (25 - 5 * any(view["translation_pitch"])) for view in views)
+    assert found["20"]["exposures"] == marks + 20 * len(views)  # 5 marks from four sides
+    assert found["20"]["minutes"] == pytest.approx(
+        5 * len(views) + found["20"]["exposures"] * 2 / 60)
+
+
+@pytest.mark.parametrize("machine", SHIPPED)
+def test_the_cell_of_every_machine_can_be_read(machine):
+    assert new(*STAGE, "--minutes", "30", "--machine", machine) == 0
+    cell = read_cell("cell.yaml")
+    assert cell.machine == machine and cell.limits["x"] == (-0.025, 0.025)
+    assert cell.placing == ("robot" if machine == "simulated" else "person")
+    assert read_plan("plan.yaml").plan_id == "plan"
+    shipped = [read_yaml(path) for path in CELLS.glob("*.yaml")]
+    own = next(data[machine] for data in shipped if data["machine"] == machine)
+    assert read_yaml("cell.yaml")[machine].keys() <= own.keys()
+
+
+@pytest.mark.parametrize(("options", "line"), [
+    ([*STAGE, "--travel", "40mm"], "40 mm along x, and 5 marks with their check stops need 40.04 "
+     "mm; take 4 marks"),
+    ([*STAGE, "--travel", "60x30mm"], "30 mm along y"),
+    ([*STAGE, "--minutes", "3"], "the shortest plan takes 20: 3 placings of 5 minutes"),
+    ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
+    ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
+    ([*STAGE, "--marks", "2"], "is not a number from 3"),
+    (["--marks", "5"], "--travel: is missing, and there is nobody to ask"),
+    ([*STAGE, "--placing", "dog"], "person, robot")])
+def test_what_cannot_work_is_refused_in_a_line(options, line, capsys):
+    assert new(*options) == 2
+    err = capsys.readouterr().err
+    assert line in err and err.count("\n") == 1
+    assert not Path("plan.yaml").exists()
+
+
+def test_nothing_is_overwritten(capsys):
+    Path("cell.yaml").write_text("mine")
+    assert new(*STAGE) == 2
+    assert "cell.yaml: exists already" in capsys.readouterr().err
+    assert Path("cell.yaml").read_text() == "mine"
+
+
+def test_a_person_is_asked_in_a_terminal(tmp_path):
+    answers = b"fifty\n50mm\n5\n10mm\n\n\nrobot\n30\n1\n\n"
+    code, said = in_terminal([*SELFCAL, "plan", "new", "-o", "plan.yaml"], folder=tmp_path,
+                             keys=answers)
+    assert code == 0, said
+    assert "'fifty' has no unit" in said and "it identifies the stage" in said
+    assert "placings of 0.5 minutes" in said and "exposures of 1 s" in said
