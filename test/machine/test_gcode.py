@@ -15,6 +15,22 @@ from test.support.firmware import Grbl, Klipper, LinuxCnc, Marlin, over_pty, ove
 pytest.importorskip("serial")
 KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
 
+QUIET = """
+plan: plan.yaml
+seed: 3
+truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
+cell: {servo_sigma: 0.0}
+"""
+PLAN = """
+plan_id: p
+artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}
+check_stops: {marks: 2, offset: 25e-6}
+views:
+  - {name: a, repeats: 2}
+  - {name: b, rotation_deg: 90}
+  - {name: c, translation_pitch: [1, 0]}
+"""
+
 
 class WithPlate(GcodeMachine):
     """A plate lies under the camera of the controller's machine."""
@@ -34,15 +50,7 @@ class WithPlate(GcodeMachine):
 @pytest.mark.parametrize("dialect", KINDS)
 @pytest.mark.parametrize("over", [over_tcp, over_pty])
 def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
-    quiet = "servo_sigma: 0.0"
-    cell, simulated = write_cell(
-        tmp_path, camera=True, simulation=(
-            "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
-            f"cell: {{{quiet}}}\n"),
-        plan="plan_id: p\nartifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}\n"
-             "check_stops: {marks: 2, offset: 25e-6}\nviews:\n  - {name: a, repeats: 2}\n"
-             "  - {name: b, rotation_deg: 90}\n  - {name: c, translation_pitch: [1, 0]}\n",
-        cell=CELL)
+    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=PLAN, cell=CELL)
     firmware = KINDS[dialect]()
     with over(firmware) as port:
         machine = WithPlate(firmware, simulated, port=port, dialect=dialect)
