@@ -79,7 +79,7 @@ MISTAKES = [Mistake(*row) for row in (
     ("plan chek config/plans/hu.yaml", 2, "did you mean 'check'"),
     ("cal", 2, "WHAT is missing: one of "),
     ("call go", 2, "'go' is unknown; known are start, confirm"),
-    ("reproduce", 2, "hu,qiao|hu or qiao|is missing"),
+    ("reproduce", 2, "hu, qiao|is missing"),
     ("report", 2, "RESULT.json is missing"),
     ("plan check config/plans/hu.yaml --sigma 20furlong", 2, "20furlong"),
     ("plan check config/plans/hu.yaml --sigma -5nm", 2, "sigma"),

@@ -10,6 +10,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.outputs import write_text
 from selfcal_ros.papers.figures import hu_figures, qiao_figures
 from selfcal_ros.papers.hu import hu_text, reproduce_hu
+from selfcal_ros.papers.ibaraki import CASE_STUDY_UM, ibaraki_text, reproduce_ibaraki
 from selfcal_ros.papers.qiao import SIZES, qiao_text, reproduce_qiao
 from selfcal_ros.parallel import Progress, check_workers
 from selfcal_ros.reporting.figures.drawing import Drawing
@@ -20,7 +21,7 @@ MANY = 1000
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("paper", choices=("hu", "qiao"))
+    parser.add_argument("paper", choices=tuple(PAPERS))
     parser.add_argument("--draws", type=int, default=200, metavar="N",
                         help="draws of noise (default 200)")
     parser.add_argument("--seed", type=int, default=1, metavar="S",
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         _make(folder)
     workers = check_workers(1 if args.workers is None and args.draws < MANY else args.workers)
     with late_progress("solving draws") as progress:
-        text, figures, numbers = (_hu if args.paper == "hu" else _qiao)(args, workers, progress)
+        text, figures, numbers = PAPERS[args.paper](args, workers, progress)
     say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})
     if folder is not None:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
@@ -90,3 +91,18 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
         "sizes": SIZES, "ranks": found.ranks.tolist(), "unknowns": found.unknowns.tolist(),
         "programs": programs, "rms_um": found.rms_um.tolist(),
         "rms_uniform_um": found.rms_uniform_um.tolist(), "bound_um": found.bound_um}
+
+
+def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
+    found = reproduce_ibaraki(args.draws, args.seed, progress=progress)
+
+    def figures() -> list[Drawing]:
+        return []
+
+    return ibaraki_text(found), figures, {
+        "table_1_mm": {case: values.tolist() for case, values in found.table_1_mm.items()},
+        "published_um": CASE_STUDY_UM, "new_um": found.new_um.tolist(),
+        "conventional_um": found.conventional_um.tolist()}
+
+
+PAPERS = {"hu": _hu, "qiao": _qiao, "ibaraki": _ibaraki}

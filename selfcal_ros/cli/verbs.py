@@ -62,7 +62,7 @@ VERBS = {
     "plate": Verb(CHECK, "draw the plate of a plan, true to size: svg, pdf, dxf or gds"),
     "simulate": Verb(CHECK, "write a bag of a simulated cell, with its known truth"),
     "step-diagonal": Verb(MORE, "axis errors from a laser step-diagonal measurement"),
-    "reproduce": Verb(MORE, "repeat the published simulations of Hu or Qiao")}
+    "reproduce": Verb(MORE, "repeat the published simulations of Hu, Qiao or Ibaraki")}
 """Verbs; `step-diagonal` is the module ``step_diagonal.py`` of this package."""
 
 EXAMPLES = {

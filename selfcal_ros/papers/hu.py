@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hu's published simulation, rerun with seeds, by Hu's law and by joint least squares."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +24,10 @@ from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.units import M_PER_UM, UM_PER_M
 
 ARTIFACT = Artifact(11, 0.01, 24)
-"""Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg."""
+"""Plate of Hu's section 4: 11 x 11 marks, 10 mm, lines every 15 deg.
+
+Hu prints the pitch as L/N; N marks have N - 1 intervals.
+"""
 AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
@@ -32,7 +36,7 @@ class Published:
     """One published table and its figures; um and deg.
 
     `table` rows are x, y, theta; columns max, min, std. The signs of the minima were lost in
-    print.
+    print, and the caption of Table 2 has the noise of Table 1.
     """
 
     name: str
@@ -41,6 +45,12 @@ class Published:
     sigma_um: float
     sigma_deg: float
     table: tuple[tuple[float, float, float], ...]
+
+    def least_std(self, row: int) -> float:
+        """Return the smallest std of as many values with the extremes of a row."""
+        high, low, _ = self.table[row]
+        count = ARTIFACT.m.size if row < 2 else ARTIFACT.angular_count  # rows: x, y, theta
+        return (high - low) / math.sqrt(2 * (count - 1))
 
 
 TABLES = (
@@ -180,6 +190,10 @@ def _table_text(run: HuRun, n_draws: int) -> list[str]:
                    for errors in (run.law, run.joint)]
         lines.append(f"{name:10}{''.join(cells[:3])} {''.join(cells[3:])} "
                      f"{spreads[0]:>22}{spreads[1]:>22}{bounds[row]:11.4g}")
+    for row, name in enumerate(names):
+        if table.table[row][2] < table.least_std(row):
+            lines.append(f"the published row of {name.split(',')[0]} contradicts itself: with its "
+                         f"max and min, its std is at least {table.least_std(row):.3g}")
     return lines
 
 

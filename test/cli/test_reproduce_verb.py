@@ -11,7 +11,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.mark.parametrize(("paper", "figures", "word"), [
-    ("hu", ["4", "5", "6", "7", "8", "9"], "Table 2"), ("qiao", ["3", "4"], "ranks as printed")])
+    ("hu", ["4", "5", "6", "7", "8", "9"], "Table 2"), ("qiao", ["3", "4"], "ranks as printed"),
+    ("ibaraki", [], "conventional:")])
 def test_text_and_plots_and_the_same_bytes_for_the_same_seed(paper, figures, word, tmp_path,
                                                             capsys):
     out = tmp_path / "new" / "folder"

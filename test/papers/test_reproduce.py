@@ -8,6 +8,12 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.papers import hu as module
 from selfcal_ros.papers.figures import hu_figures, qiao_figures
 from selfcal_ros.papers.hu import hu_text, reproduce_hu
+from selfcal_ros.papers.ibaraki import (
+    CASE_STUDY_UM,
+    ESTIMATED_MM,
+    ibaraki_text,
+    reproduce_ibaraki,
+)
 from selfcal_ros.papers.qiao import ROWS, SIZES, qiao_text, reproduce_qiao
 from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.reporting.figures.drawing import Discs, Path
@@ -106,6 +112,30 @@ def test_hus_text_shows_tables_and_figures(hu):
     series = text.split("Figure 8")[1].splitlines()[1]
     assert len(series.split(":")[1].split()) == 10
     assert "+- nan" in hu_text(reproduce_hu(1, seed=3))
+
+
+def test_hus_text_names_the_row_that_contradicts_itself(hu):
+    """Values with given extremes scatter least if all others lie in the middle."""
+    said = [line for line in hu_text(hu).splitlines() if "contradicts" in line]
+    assert len(said) == 1 and said[0].startswith("the published row of EGth contradicts itself")
+    assert hu_text(hu).index("Table 2") < hu_text(hu).index(said[0])
+    for table in module.TABLES:
+        for row, count in enumerate((121, 121, 24)):
+            high, low, std = table.table[row]
+            least = np.std([high, low, *[(high + low) / 2] * (count - 2)], ddof=1)
+            assert table.least_std(row) == pytest.approx(least)
+            assert (std < least) == (table.name == "Table 2" and row == 2)
+
+
+def test_ibarakis_figures_stand_beside_ours():
+    found = reproduce_ibaraki(20, seed=1)
+    for case, values in found.table_1_mm.items():
+        assert values == pytest.approx(ESTIMATED_MM[case], abs=2e-4)
+    measured, _, conventional = np.array(list(CASE_STUDY_UM.values()), dtype=float).T
+    assert found.new_um.mean(axis=0) == pytest.approx(measured, abs=0.01)
+    assert found.conventional_um.mean(axis=0) == pytest.approx(conventional, abs=0.2)
+    rows = {line[:16].strip(): line.split()[-6:] for line in ibaraki_text(found).splitlines()}
+    assert rows["squareness"] == ["squareness", "-1.22", "-1.32", "-1.22", "-1.37", "-1.22"]
 
 
 def test_qiaos_ranks_programs_and_bound(qiao):
