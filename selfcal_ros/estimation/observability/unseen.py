@@ -134,15 +134,16 @@ def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> tuple[str, str]
             return (f"{line[:-1]} offsets",
                     f"offsets of the {line} against each other, in x and in y"
                     + (f", opposite in opposite {line}" if len(turns) > 1 else ""))
+    own = f"{2 * n - 2} numbers beside the datum"  # rotation and scale, or the translations
     if len(shifts) == 1:
         turn = "quarter" if any(t % 2 for t in turns) else "half"
         return ("rotation-symmetric fields", f"rotation-symmetric fields: every field that a "
-                f"{turn} turn maps to itself ({2 * n} numbers)")
+                f"{turn} turn maps to itself ({own})")
     period = _period(label)
     if period:
         along = " and ".join(f"every {p} pitches along {a}"
                              for p, a in zip(period, "xy", strict=True) if p > 1)
-        return "periodic fields", f"patterns that repeat {along} ({2 * n} numbers)"
+        return "periodic fields", f"patterns that repeat {along} ({own})"
     return ("separate groups of sites", f"{n} groups of sites that no reading connects: "
             f"each may move independently; the smallest is {_smallest(grid, label)}")
 

@@ -136,6 +136,15 @@ def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_differe
         assert plan_observability(plan_of("0, tx, ty", size)).deficiency == 2
 
 
+@pytest.mark.parametrize("size", [3, 5, 7, 11])
+def test_four_turns_leave_half_of_n_squared_less_5_fields(size):
+    """Those that a quarter turn maps to itself, without rotation and scale, which are datum."""
+    orbits = (size**2 - 1) // 4  # of sites under a quarter turn; the centre stays
+    seen = check_plan(plan_of("0, 90, 180, 270", size)).observability
+    assert seen.deficiency == 2 * orbits - 2 == (size**2 - 5) // 2
+    assert seen.modes[0].endswith(f"({seen.deficiency} numbers beside the datum)")
+
+
 @pytest.mark.parametrize(("views", "expected"), [
     ("0", ["every field"]),
     ("tx", ["every field", "sites never visited", "marks never read"]),
@@ -163,14 +172,15 @@ def test_unseen_modes_in_words():
                      "scale difference of the axes: Gx = R x, Gy = -R y")
     modes = check_plan(plan_of("0, 90", 5, count=8)).observability.modes
     assert modes == ("rotation-symmetric fields: every field that a quarter turn maps to itself "
-                     "(12 numbers)", "angular map: patterns that repeat every 2 lines")
+                     "(10 numbers beside the datum)",
+                     "angular map: patterns that repeat every 2 lines")
     half = check_plan(plan_of("0, 180", 5)).observability.modes[-1]
     assert "half turn" in half
     rows = check_plan(plan_of("0, 180, tx", 5)).observability.modes[-1]
     assert rows.endswith("opposite in opposite rows")
     double = check_plan(plan_of("0, tx2, ty2", 7)).observability.modes[-1]
     assert double == ("patterns that repeat every 2 pitches along x and every 2 pitches along y "
-                      "(8 numbers)")
+                      "(6 numbers beside the datum)")
 
 
 @pytest.mark.parametrize(("views", "first"), [
