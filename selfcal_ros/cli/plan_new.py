@@ -339,7 +339,7 @@ def _next(plan: Plan) -> Suggestion:
 def _cell_text(known: Known, simulation: str) -> str:
     """Return CELL.yaml, the places to be edited named in comments."""
     own = (f"{{simulation: {simulation}}}" if known.machine == "simulated" else
-           f"{OWN_KEYS[known.machine]}  # edit: docs/machines.md")
+           f"{OWN_KEYS[known.machine]}  # edit these")
     x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in known.travel)
     theta = ", theta: [-7.0, 7.0]" if known.lines else ""
     lines = ["# From `selfcal plan new`.", f"machine: {known.machine}", f"{known.machine}: {own}",

@@ -65,8 +65,8 @@ class CompensatingSession:
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(path, "the map is not qualified", "measure again, or set "
                              "require_qualified to false")
-        self._use(result.error_map, f"{Path(path).resolve()}, plan {result.plan_id}", 0,
-                  result.interpolation)
+        read_from = Path(result.read_from[0] if result.read_from else path).resolve()
+        self._use(result.error_map, f"{read_from}, plan {result.plan_id}", 0, result.interpolation)
 
     def take_map(self, message: Any) -> None:
         """Take a selfcal_msgs/ErrorMap: use it, now or once its summary confirms it."""

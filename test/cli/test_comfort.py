@@ -69,7 +69,7 @@ def test_a_name_that_no_file_can_have_is_one_line(tmp_path, monkeypatch, capsys,
     assert main(words.replace("LONG", "x" * 300).split()) == 2
     out, err = capsys.readouterr()
     assert not out
-    assert re.fullmatch(r"selfcal \S+: \S+: .*(File name too long|Is a directory).*\n", err)
+    assert re.fullmatch(r"selfcal \S+: \S+: .*(File name too long|is a folder).*\n", err)
 
 
 def test_names_like_one_another():
@@ -287,7 +287,8 @@ RUNS = {
 NEEDS_NODES = {"replay", "up", "monitor", "call", "cell check"}
 ELSEWHERE = {"detect": "test_detect.py", "recheck": "test_recheck.py",
              "camera init": "test_camera.py", "measure": "test_measure.py",
-             "cell try": "test_cell_try.py", "verify": "test_verify.py"}
+             "cell try": "test_cell_try.py", "verify": "test_verify.py",
+             "history": "test_history.py"}
 """Verbs whose bags are made by other tests."""
 
 

@@ -17,6 +17,7 @@ ELSEWHERE = {"up": "needs ROS", "monitor": "needs ROS", "call": "needs a cell",
              "measure": "test/cli/test_measure.py", "replay": "test/tools/test_demo.py",
              "camera init": "needs a bag of its own", "recheck": "test/cli/test_recheck.py",
              "diff": "below", "combine": "below", "verify": "test/cli/test_verify.py",
+             "history": "test/cli/test_history.py",
              "reproduce": "slow: test/cli/test_reproduce_verb.py"}
 """Verbs whose example is not run here, and why."""
 ALL = """

@@ -66,7 +66,9 @@ def test_commands_run(page, desk, capsys):
     for command, code in run:
         words = shlex.split(command)
         if "-o" in words:  # one of two ways to write the same file
-            (desk / words[words.index("-o") + 1]).unlink(missing_ok=True)
+            written = desk / words[words.index("-o") + 1]
+            written.unlink(missing_ok=True)
+            written.parent.mkdir(exist_ok=True)  # the page says mkdir
         found = main(words[1:])
         error = capsys.readouterr().err
         assert found == code, f"{page.name}: {command}: {error}"

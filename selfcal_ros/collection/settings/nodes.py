@@ -210,7 +210,8 @@ class CompensatorSettings(ManagedSettings):
         choices=get_args(Interpolation))
     outside: Outside = declared(
         "clamp", "treatment of positions outside the field", choices=get_args(Outside))
-    map: str = declared("", "RESULT.json to start with; empty = wait for selfcal/error_map")
+    map: str = declared("", "RESULT.json to start with, or a folder with an active map (selfcal "
+                        "history); empty = wait for selfcal/error_map")
     require_qualified: bool = declared(
         True, "use only maps that are qualified, of one run, and based on all planned views; false "
         "= any map")

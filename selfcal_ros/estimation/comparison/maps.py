@@ -61,6 +61,8 @@ class Significance:
         Degrees of freedom of the noise behind both uncertainties; infinite if known.
     significant : bool
         The verdict of both tests.
+    u_rms, u_largest : float
+        Standard uncertainty of the values: root mean square, and that of the largest.
     """
 
     chi2_ratio: float
@@ -72,6 +74,8 @@ class Significance:
     p_z: float = float("nan")
     noise_dof: float = float("inf")
     significant: bool = False
+    u_rms: float = float("nan")
+    u_largest: float = float("nan")
 
 
 def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
@@ -113,8 +117,10 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
               else chdtrc(dof, square))
     largest = float(abs(z).max())
     p_z, limit = _of_largest(largest, len(z), root, noise_dof)
+    of_largest = variance[np.abs(values).argmax()]
     return Significance(square / dof, dof, p, correlated, largest, limit, p_z, noise_dof,
-                        min(p, p_z) < DIFFERENCE_LEVEL / 2)
+                        min(p, p_z) < DIFFERENCE_LEVEL / 2, u_rms=float(np.sqrt(variance.mean())),
+                        u_largest=float(np.sqrt(max(of_largest, 0.0))))
 
 
 def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:

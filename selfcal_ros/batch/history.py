@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibrations of a stage in a folder: their changes, and when the next one is due."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.comparison.maps import MapDifference, compare
+from selfcal_ros.files import read_text
+from selfcal_ros.model.result import SCHEMA, CalibrationResult
+from selfcal_ros.results import read_result
+
+S_PER_DAY = 86400.0
+COVERAGE = 2.0
+"""Coverage factor of U and of the drift that could have been missed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A calibration of the folder.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    result : CalibrationResult
+        Its content.
+    measured : datetime
+        First exposure, or when it was computed if that is not known.
+    change : MapDifference or str
+        Against the one before; why it was not compared, "" for the first.
+    """
+
+    path: Path
+    result: CalibrationResult
+    measured: datetime
+    change: MapDifference | str = ""
+
+    @property
+    def kind(self) -> str:
+        """``calibration``, ``recheck`` or ``mean``."""
+        extra = self.result.extra
+        return "recheck" if "recheck" in extra else "mean" if "combined" in extra else "calibration"
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How fast the stage departs from the active map, rms of a coordinate.
+
+    Attributes
+    ----------
+    per_day_m, u_per_day_m : float
+        Drift and its standard uncertainty, m.
+    limit_m : float
+        U of the active map, rms, which the drift may reach.
+    due : datetime or None
+        When the drift, or the largest that may have been missed, reaches it; None if never.
+    """
+
+    per_day_m: float
+    u_per_day_m: float
+    limit_m: float
+    due: datetime | None
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether a drift is observed at all."""
+        return self.per_day_m > COVERAGE * self.u_per_day_m
+
+
+def history(folder: Path) -> list[Entry]:
+    """Return the calibrations of a folder in the order of their measurement.
+
+    Files below it that are not results are passed over, whatever wrote them.
+
+    Raises
+    ------
+    InputError
+        If it is not a folder, or a result cannot be read.
+    NoDataError
+        If it has no result with a map.
+    """
+    if not folder.is_dir():
+        raise InputError(str(folder), "is not a folder", "name the folder of the calibrations")
+    found = []
+    for path in sorted(folder.rglob("*.json")):
+        if _is_result(path):
+            result = read_result(path)
+            if result.observability.identifiable:
+                found.append(Entry(path, result, _measured(result, str(path))))
+    if not found:
+        raise NoDataError(str(folder), "no RESULT.json with a map is in it",
+                          "write the results of `selfcal solve` there")
+    found.sort(key=lambda entry: (entry.measured, entry.result.provenance.created))
+    return [Entry(entry.path, entry.result, entry.measured, _change(found[max(at - 1, 0)], entry))
+            for at, entry in enumerate(found)]
+
+
+def _is_result(path: Path) -> bool:
+    try:
+        data = json.loads(read_text(path))
+    except (InputError, ValueError):
+        return False
+    return isinstance(data, dict) and data.get("schema") == SCHEMA
+
+
+def _measured(result: CalibrationResult, where: str) -> datetime:
+    provenance = result.provenance
+    text = provenance.extra.get("first_exposure") or provenance.created
+    try:
+        when = datetime.fromisoformat(str(text))
+    except ValueError:
+        raise InputError(where, "it does not tell when it was measured",
+                         "solve its bag again, or take it out of the folder") from None
+    return when if when.tzinfo else when.replace(tzinfo=UTC)
+
+
+def _change(before: Entry, entry: Entry) -> MapDifference | str:
+    if before is entry:
+        return ""
+    try:
+        return compare(before.result, entry.result, names=(str(before.path), str(entry.path)))
+    except InputError as error:  # another lattice, or nothing that both know
+        return error.what
+
+
+def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
+    """Return the drift about the active map; None if nothing can be compared with it.
+
+    The part of each rms difference beyond its u, over the time between, a line through the active
+    map by least squares.
+    """
+    days, changes, u = [], [], []
+    for entry in entries:
+        apart = abs((entry.measured - active.measured).total_seconds()) / S_PER_DAY
+        found = _change(active, entry)
+        if isinstance(found, str) or not apart or found.xy is None:
+            continue
+        days.append(apart)
+        u.append(found.xy.u_rms)
+        changes.append(math.sqrt(max(found.rms_m**2 - found.xy.u_rms**2, 0.0)))
+    if not days:
+        return None
+    t = np.array(days)
+    per_day = float(t @ changes / (t @ t))
+    u_per_day = float(np.hypot.reduce(t * u) / (t @ t))
+    emap = active.result.error_map
+    limit = COVERAGE * float(np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))))
+    drift = Drift(per_day, u_per_day, limit, None)
+    rate = per_day if drift.is_clear else COVERAGE * u_per_day
+    try:
+        due = active.measured + timedelta(days=limit / rate) if rate else None
+    except OverflowError:  # thousands of years
+        due = None
+    return Drift(per_day, u_per_day, limit, due)
