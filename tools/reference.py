@@ -191,6 +191,16 @@ def parameter_row(p: Parameter) -> tuple[str, ...]:
     return f"`{p.name}`", " ".join(filter(None, (value(p.default), p.unit, allowed))), p.description
 
 
+def parameters_of_several_nodes() -> list[Parameter]:
+    """Return the parameters that two nodes or more declare alike."""
+    every = [parameter for parameters in NODE_PARAMETERS.values() for parameter in parameters]
+    return list(dict.fromkeys(p for p in every if every.count(p) > 1 and p.name not in SIMULATED))
+
+
+def nodes_with(parameter: Parameter) -> str:
+    return ", ".join(node for node, declared in NODE_PARAMETERS.items() if parameter in declared)
+
+
 def message_rows() -> Iterator[tuple[str, ...]]:
     """Yield each message, service and action with what its definition says at its beginning."""
     for kind in ("msg", "srv", "action"):
@@ -212,8 +222,13 @@ def text(result: dict[str, Any]) -> str:
              "Present only if requested, or if there is something to report:", "",
              *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
              "## Parameters", ""]
+    shared = parameters_of_several_nodes()
+    lines += ["### several nodes", "", *table(
+        ("parameter", "default (allowed)", "meaning", "nodes"),
+        [(*parameter_row(p), nodes_with(p)) for p in shared]), ""]
     for node, parameters in NODE_PARAMETERS.items():
         lines += [f"### {node}", ""]
+        parameters = [p for p in parameters if p not in shared]
         if node == "stage_simulator":
             lines += ["Also the keys of `physics`, `noise` and `cell` of SIM.yaml, without the "
                       "name of their section, and `encoder` and `rotation` of its `truth`.", ""]
