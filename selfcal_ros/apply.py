@@ -7,6 +7,9 @@
 """
 
 import os
+from importlib import import_module
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +18,7 @@ from selfcal_ros.compensation.cells import SNAP, Interpolation, Outside, cubic_p
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.results import read_result
 
@@ -54,6 +58,72 @@ class StageMap(Compensator):
         own: Interpolation = fitted if fitted and whole else "bilinear"
         super().__init__(result.error_map, method=method or own, outside=outside, fitted=fitted)
         self.result = result
+
+    def __repr__(self) -> str:
+        from selfcal_ros.reporting.summary.sections import state_line  # words, where they are read
+
+        return f"<StageMap {self.result.plan_id}: {state_line(self.result)}>"
+
+    def _repr_html_(self) -> str:
+        """Return the picture of `plot` for a notebook."""
+        from selfcal_ros.reporting.figures.maps import map_picture  # figures, where they are seen
+        from selfcal_ros.reporting.figures.svg import printed_svg  # likewise
+
+        return f'<div style="background: white">{printed_svg(map_picture(self.result))}</div>'
+
+    def plot(self) -> Any:
+        """Return the maps as a figure of matplotlib: verdict, vectors with U, angular error."""
+        from selfcal_ros.reporting.figures.maps import map_picture  # figures, where they are seen
+        from selfcal_ros.reporting.figures.paper import figure  # matplotlib, for this alone
+
+        return figure(map_picture(self.result))
+
+    def difference(self, other: "StageMap") -> MapDifference:
+        """Return the map of `other` minus this one, as `selfcal diff` compares them.
+
+        Raises
+        ------
+        InputError
+            If the maps have other nodes.
+        """
+        return compare(self.result, other.result)
+
+    def to_dataframe(self) -> Any:
+        """Return the nodes as a table of pandas: x, y, gx, gy, u_gx, u_gy, m; NaN where unknown.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        plate, emap = self.error_map.artifact, self.error_map
+        columns = {"x": plate.x_m, "y": plate.y_m, "gx": emap.gx, "gy": emap.gy,
+                   "u_gx": emap.u_gx, "u_gy": emap.u_gy}
+        return _library("pandas").DataFrame({name: values.ravel()
+                                             for name, values in columns.items()})
+
+    def to_xarray(self) -> Any:
+        """Return the maps as a data set of xarray, m and rad.
+
+        gx, gy, u_gx, u_gy over the nodes (x, y), and g_theta, u_g_theta over the angles (theta) of
+        a map with lines; `plan_id`, `grade` and the coverage factor `k` are attributes.
+
+        Raises
+        ------
+        InputError
+            If xarray is not installed.
+        """
+        emap, plate = self.error_map, self.error_map.artifact
+        coordinates = {"x": plate.x_m[:, 0], "y": plate.y_m[0]}
+        maps: dict[str, tuple] = {name: (("x", "y"), getattr(emap, name), {"units": "m"})
+                                  for name in ("gx", "gy", "u_gx", "u_gy")}
+        if self.has_theta:
+            coordinates["theta"] = 2 * np.pi * np.arange(len(emap.g_theta)) / len(emap.g_theta)
+            maps |= {name: (("theta",), getattr(emap, name), {"units": "rad"})
+                     for name in ("g_theta", "u_g_theta")}
+        return _library("xarray").Dataset(maps, coordinates, {
+            "plan_id": self.result.plan_id, "grade": self.result.verdict.grade.value,
+            "k": self.result.noise.k_xy})
 
     def covariance(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return the covariance of Gx at all points, then Gy at all points, (2P, 2P), m^2.
@@ -212,6 +282,13 @@ class StageMap(Compensator):
             return ((c[3] * inside + c[2]) * inside + c[1]) * inside + c[0]
         unit = np.eye(count)
         return (1 - inside) * unit[below] + inside * unit[below + 1]
+
+
+def _library(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise InputError(name, "not installed", f"pip install {name}") from error
 
 
 def _along(cover: np.ndarray, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:

@@ -292,3 +292,50 @@ def test_u_of_distances_is_their_error_on_a_map_with_nodes_of_its_own():
         ratios.append((error - true_error) / u)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(0.98, abs=0.07)
     assert np.mean(np.abs(ratios) < 2) == pytest.approx(0.954, abs=0.025)
+
+
+def test_the_notebook_runs_and_finds_the_days_alike(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLE.parent / "explore.py"))
+    said = capsys.readouterr().out
+    assert "<StageMap small: Good: " in said and "significant: False" in said
+    assert (tmp_path / "day_1.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_notebook_shows_the_picture_and_text_shows_the_state(result):
+    stage = StageMap(result)
+    assert repr(stage).startswith(f"<StageMap {result.plan_id}: Good: error up to ")
+    page = stage._repr_html_()
+    assert page.startswith("<div") and page.count("<svg") == 1 and "fill=\"#" in page
+
+
+def test_two_maps_differ_as_diff_says(result):
+    changed = result.error_map.gx.copy()
+    changed[1, 2] += 4e-7
+    other = replace(result, error_map=replace(result.error_map, gx=changed))
+    found = StageMap(result).difference(StageMap(other))
+    assert found.dx[1, 2] == pytest.approx(4e-7, rel=0.1) and found.significant
+
+
+@pytest.mark.parametrize("name", ["dataframe", "xarray"])
+def test_without_the_library_one_line_says_so(result, name, monkeypatch):
+    library = {"dataframe": "pandas", "xarray": "xarray"}[name]
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match=f"^{library}: not installed; pip install {library}$"):
+        getattr(StageMap(result), f"to_{name}")()
+
+
+def test_a_data_frame_has_each_node_at_its_place(result):
+    pytest.importorskip("pandas")
+    table = StageMap(result).to_dataframe().set_index(["x", "y"])
+    plate, emap = result.artifact, result.error_map
+    row = table.loc[(plate.x_m[3, 0], plate.y_m[3, 0])]
+    assert (row.gx, row.u_gy) == (emap.gx[3, 0], emap.u_gy[3, 0]) and len(table) == emap.gx.size
+
+
+def test_a_data_set_has_the_maps_over_their_places(result):
+    pytest.importorskip("xarray")
+    maps, emap, plate = StageMap(result).to_xarray(), result.error_map, result.artifact
+    assert float(maps.gy.sel(x=plate.x_m[3, 0], y=plate.y_m[3, 0])) == emap.gy[3, 0]
+    assert float(maps.theta[3]) == pytest.approx(3 * 2 * np.pi / plate.angular_count)
+    assert float(maps.g_theta[3]) == emap.g_theta[3] and maps.attrs["grade"] == "good"

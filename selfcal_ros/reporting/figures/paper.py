@@ -50,12 +50,18 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
     if kind not in KINDS:
         raise InputError(str(path), "not a picture format by its suffix",
                          "name a file that ends in .png, .svg or .pdf")
+    page, data = figure(drawing), io.BytesIO()
+    with rc_context(RC):
+        page.savefig(data, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
+    write_bytes(path, data.getvalue())
+
+
+def figure(drawing: Drawing) -> Figure:
+    """Return a drawing as a figure of matplotlib."""
     with rc_context(RC):
         page = Figure(figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH))
         put(drawing, page.add_axes((0, 0, 1, 1)), 1.0)
-        data = io.BytesIO()
-        page.savefig(data, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
-    write_bytes(path, data.getvalue())
+    return page
 
 
 def put(drawing: Drawing, axes: Axes, points: float) -> None:
