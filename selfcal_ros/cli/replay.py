@@ -10,7 +10,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.bagio.offline import BagLines, Playlist, bag_input, bag_lines
+from selfcal_ros.bagio.offline import (
+    BagLines,
+    BagSession,
+    Playlist,
+    bag_input,
+    bag_lines,
+    collect_bag,
+)
 from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
 from selfcal_ros.cli.terminal import (
     add_json,
@@ -27,10 +34,11 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_json, write_yaml
 from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
+from selfcal_ros.topics import INPUT_TOPICS
 
 AS_RECORDED = -1
 LARGEST_SEED = 2**31
@@ -93,11 +101,34 @@ def run(args: argparse.Namespace) -> int:
     if on_stdout(args):
         put(data)
     if code:  # a result without a map
+        _refuse_fault(args, code, detector)
         return code
     result = result_from_dict(data, args.bag)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
+
+
+def offline(args: argparse.Namespace) -> BagSession:
+    """Return what `selfcal solve` collects from the bag."""
+    return collect_bag(args.bag, node_settings(args.params, CollectorSettings),
+                       namespace=args.namespace)
+
+
+def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSettings | None) -> None:
+    """Refuse a plan that is not identified because of a fault of the cell, as `solve` does.
+
+    Raises
+    ------
+    InputError
+        With the fault, such as a plate that lies otherwise than planned.
+    """
+    if code != ExitCode.NOT_IDENTIFIABLE or detector is not None:
+        return
+    session = offline(args)
+    for fault in session.findings:
+        if fault not in session.lost:
+            raise InputError(args.bag, fault, "correct this first")
 
 
 def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
@@ -107,10 +138,15 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
     ------
     InputError
         If one of them is missing or wrong, or is given where no image is played.
+    NoDataError
+        If the bag has no detections, commands or encoder samples.
     """
     options = given(args, OPTIONS)
-    transport = Playlist(Path(args.bag), args.namespace).transport
+    playlist = Playlist(Path(args.bag), args.namespace)
+    transport = playlist.transport
     if not transport:
+        if not playlist.counts.keys() >= INPUT_TOPICS.keys():
+            offline(args)  # raises what is missing
         for name in (name for name, value in options.items() if value is not None):
             raise InputError(f"--{name.replace('_', '-')}", f"no images of {args.bag} are played",
                              "leave it out; it is for bags with images and no detections")

@@ -273,7 +273,8 @@ class SolvingSession:
     def _take_none(self, outcome: Outcome) -> None:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
-        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns, "")
+        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns,
+                           job.digest)
         self._publish_summary()
         if not self._unfinished():
             raise outcome.problem or ValueError("neither a result nor a problem")
@@ -353,7 +354,7 @@ class SolvingSession:
         return state_line(self.shown.result)
 
     def digest(self) -> str:
-        """Return the fingerprint of the readings behind the published map; "" = none."""
+        """Return the fingerprint of the readings behind what is shown; "" = none."""
         return "" if self._stale else self.shown.digest
 
     def save(self, path: str) -> tuple[str, str]:

@@ -33,6 +33,7 @@ from test.support.mark_lists import listed_plan
 from test.support.plans import image_plan, placed_plan
 from test.support.ports import settings_of
 from test.support.sessions import events_of, small_bag, small_plan, stepped_bag
+from test.support.verbs import simulate
 
 
 def undated(text: str) -> str:
@@ -145,19 +146,19 @@ def test_processes_give_the_result_of_solve_bit_for_bit(
     (["--namespace", "/"], ["1.0", "-1", "/"]),
     (["--namespace", "cell2"], ["1.0", "-1", "/cell2"])], ids=" ".join)
 def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
-        monkeypatch, solved, options, arguments):
-    started = {}
+        monkeypatch, two_cells, solved, options, arguments):
+    started, bag = {}, str(two_cells if "cell2" in options else solved[0])
 
     @contextmanager
     def process(module, given, *_, **__):
         started[module.removeprefix("selfcal_ros.nodes.")] = given
         yield SimpleNamespace(stdout=["progress 3 4\n"], wait=lambda: 4)
     monkeypatch.setattr(replay_verb, "process", process)
-    assert selfcal(["replay", str(solved[0]), *options]) == 4
+    assert selfcal(["replay", bag, *options]) == 4
     assert list(started) == [*replay_verb.NODES, "replay_session"]
-    bag, *rest = started["replay_session"][:5]
+    played_bag, *rest = started["replay_session"][:5]
     saved = rest.pop(2)
-    assert (bag, rest) == (str(solved[0]), arguments)
+    assert (played_bag, rest) == (bag, arguments)
     assert f"result_folder:={Path(saved).parent}" in started["solver"]
 
 
@@ -172,6 +173,47 @@ def test_a_deficient_bag_ends_with_code_3_and_the_result_of_solve(graph, tmp_pat
     [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
     assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
     assert result_text(session, bag, tmp_path) == undated(solved.read_text())
+
+
+def test_a_bag_without_marks_ends_at_once_as_by_solve(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(replay_verb, "process", None)  # no node is started
+    bag = Foreign().write(tmp_path / "x.mcap", [
+        event for event in events_of(small_plan()) if not isinstance(event, Detection)])
+    assert selfcal(["solve", str(bag)]) == 4
+    said = capsys.readouterr().err
+    assert "no message on stage/mark_detections; record this topic too" in said
+    assert selfcal(["replay", str(bag)]) == 4
+    assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
+
+
+def test_detections_that_are_all_rejected_end_the_session_with_code_4(graph, tmp_path, capfd):
+    bag = Foreign().write(tmp_path / "x.mcap", [
+        replace(event, score=1e-3) if isinstance(event, Detection) else event
+        for event in events_of(small_plan())])
+    assert played(graph, bag, tmp_path).exit_code == 4
+    assert "selfcal replay: plan '0, 90, tx': no grid mark was read" in capfd.readouterr().err
+
+
+def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(monkeypatch, tmp_path, capsys):
+    plan = {"plan_id": "p", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
+            "views": [{"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
+                      {"name": "c", "translation_pitch": [1, 0], "repeats": 2}]}
+    simulate(tmp_path, "turned", plan, placed=[{"name": "b", "rotation_deg": 180}])
+    simulate(tmp_path, "deficient", plan | {"views": plan["views"][:2]})
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        """Stand for a session that found the plan not identified."""
+        if module.endswith("replay_session"):
+            assert selfcal(["solve", given[0], "--quiet", "-o", given[3]]) in (2, 3)
+            capsys.readouterr()
+        yield SimpleNamespace(stdout=[], wait=lambda: 3)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", str(tmp_path / "turned"), "--fast"]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "the plate lies turned by 180°, not by 90°" in line and "correct this first" in line
+    assert selfcal(["replay", str(tmp_path / "deficient"), "--fast"]) == 3
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("noted", [False, True], ids=["played fast", "in real time"])

@@ -308,6 +308,7 @@ def test_lines_of_all_views_are_a_beginning_until_done(desk):
     with pytest.raises(NoDataError, match="no grid mark was read"):
         alone.solve()
     assert alone.session.diagnosis().level == Level.WARN
+    assert alone.session.digest() == alone.session.diagnosis().values["readings"] != ""  # solved
     ended = Desk()  # where DONE came first
     ended.session.take_command(command(4, phase=Phase.DONE))
     with pytest.raises(NoDataError, match="no grid mark was read"):
