@@ -24,6 +24,7 @@ from selfcal_ros.vision.images import Picture
 
 SHOWN = 5
 """Number of problems that are printed."""
+WITH_IDS = OPTIONS | {"aruco": "aruco"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         "with --positions")
     parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
                         "create: the detections and all other topics, without the images")
-    add_parameters(parser, DetectorSettings, OPTIONS)
+    add_parameters(parser, DetectorSettings, WITH_IDS)
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
                         "of mark_detector is used")
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the camera, for bags "
@@ -48,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    settings = replace(node_settings(args.params, DetectorSettings, **given(args, OPTIONS)),
+    settings = replace(node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)),
                        max_marks=ANY_NUMBER)
     draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or "options", draw)

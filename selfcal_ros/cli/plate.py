@@ -27,6 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mark-width", type=float, metavar="M", default=0.0,
                         help="width of the line of a ring or cross, m (default: a fifth of its "
                         "size)")
+    parser.add_argument("--aruco", action="store_true", help="ArUco markers around the marks, from "
+                        "which `selfcal detect --aruco` knows the marks (needs OpenCV)")
     parser.add_argument("--paper", choices=tuple(PAPERS_MM), help="sheet of paper to print it on, "
                         "for trying")
     add_json(parser)
@@ -37,12 +39,14 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.plan], [args.output])
     plan = read_plan(args.plan)
     size = plan.artifact.grid_pitch_m / 5 if args.mark_size is None else args.mark_size
-    art = artwork_of(plan, mark=args.mark, size_m=size, width_m=args.mark_width)
+    art = artwork_of(plan, mark=args.mark, size_m=size, width_m=args.mark_width,
+                     aruco=args.aruco)
     save_artwork(art, args.output, args.paper or "")
     left, low, right, high = art.box
     lines = [f"{args.output}: {plan.artifact.m.size} marks ({args.mark}, {size:g} m), "
              f"{plan.artifact.angular_count} lines, {right - left:.4g} x {high - low:.4g} mm; the "
-             "dot beyond a corner is beside mark (h, h)", *([ON_PAPER] if args.paper else [])]
+             "dot beyond a corner is beside mark (h, h), the numbers are m and n",
+             *([ON_PAPER] if args.paper else [])]
     say(args, "\n".join(lines), {"written": args.output, "marks": plan.artifact.m.size,
                                  "mark_size": size})
     return int(ExitCode.DONE)

@@ -7,6 +7,7 @@ Plate axes, mm: x to the right, y upwards, the centre of the plate at (0, 0).
 import io
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,6 +16,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.edge_markers import AWAY, DICTIONARY, SIDE, edge_markers
 from selfcal_ros.model.view import Plan
 from selfcal_ros.outputs import write_bytes, write_text
 from selfcal_ros.reporting.figures.drawing import round_down
@@ -40,8 +43,9 @@ class Artwork:
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """Left, lower, right and upper edge of the outlines, with a margin."""
-        points = np.concatenate(self.outlines)
+        """Left, lower, right and upper edge of the outlines and texts, with a margin."""
+        written = [(x, y - 0.3 * size) for _, x, y, size in self.labels]
+        points = np.concatenate([*self.outlines, *([written] if written else [])])
         low, high = points.min(axis=0), points.max(axis=0)
         margin = 0.03 * float((high - low).max())
         left, lower = low - margin
@@ -49,7 +53,8 @@ class Artwork:
         return float(left), float(lower), float(right), float(upper)
 
 
-def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0) -> Artwork:
+def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0,
+               aruco: bool = False) -> Artwork:
     """Return the artwork of the plate of a plan.
 
     Parameters
@@ -60,11 +65,13 @@ def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0) ->
         ``disc``, ``ring``, ``cross`` or ``corner``, of the dimensions that `selfcal detect` takes.
     size_m, width_m : float
         Size of a mark and width of its line; 0 is a fifth of the size.
+    aruco : bool
+        Whether ArUco markers stand around the marks, see `selfcal_ros.model.edge_markers`.
 
     Raises
     ------
     InputError
-        If the marks touch each other.
+        If the marks touch each other, or there can be no markers.
     """
     plate, size = plan.artifact, size_m * MM_PER_M
     places = np.stack([plate.x_m.ravel(), plate.y_m.ravel()], axis=1) * MM_PER_M
@@ -78,17 +85,65 @@ def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0) ->
     low, high = places.min(axis=0), places.max(axis=0)
     step = plate.grid_pitch_m * MM_PER_M if not plate.marks else nearest
     outlines.append(_circle(0.2 * step) + high + 0.75 * step)  # the corner (h, h)
-    edge = float(np.hypot(*places.T).max()) + 1.5 * step
+    markers = _markers(plate, step) if aruco else []
+    outlines += markers
+    beside = (AWAY + SIDE / 2 if markers else 0) * step
+    edge = float(np.hypot(*places.T).max()) + 1.5 * step + beside
     for angle in plate.theta_rad:
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         outlines.append((_box(step, step / 20) + np.array([edge + step / 2, 0.0])) @ turn)
-    bottom = -(edge + step) if plate.angular_count else float(low[1])
+    bottom = -(edge + step) if plate.angular_count else float(low[1]) - beside
     length, below = round_down(float(high[0] - low[0]) / 2), bottom - 1.5 * step
     left = float(low[0])
     outlines.append(_box(length, step / 10) + np.array([left + length / 2, below]))
     letters = 0.35 * step
     return Artwork(outlines, [(f"{length:g} mm", left, below + 0.2 * step, letters),
-                              (plan.plan_id, left, below - 0.6 * step, letters)])
+                              (plan.plan_id, left, below - 0.6 * step, letters),
+                              *_numbers(plate, step, beside)])
+
+
+def _numbers(plate: Artifact, step: float,
+             beside: float) -> Iterator[tuple[str, float, float, float]]:
+    """Yield the numbers m below the columns of a lattice, and n to the left of its rows."""
+    if plate.marks:
+        return
+    letters = 0.25 * step
+    x, y = plate.x_m[:, 0] * MM_PER_M, plate.y_m[0] * MM_PER_M
+    for m, at in zip(plate.m[:, 0].tolist(), x.tolist(), strict=True):
+        middle = at - 0.3 * letters * len(str(m))
+        yield str(m), middle, float(y[0]) - beside - 0.8 * step, letters
+    for n, at in zip(plate.n[0].tolist(), y.tolist(), strict=True):
+        yield str(n), float(x[0]) - beside - 0.9 * step, at - 0.35 * letters, letters
+
+
+def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
+    """Return the black cells of the markers of a lattice, those side by side in one outline."""
+    if plate.marks:
+        raise InputError("--aruco", "markers stand around a lattice, the plate is a list of marks",
+                         "leave --aruco out")
+    try:
+        import cv2  # extra camera
+    except ModuleNotFoundError as error:
+        raise InputError("--aruco", "OpenCV, which has the patterns, is not installed",
+                         "pip install 'selfcal_ros[camera]', or leave --aruco out") from error
+    patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
+    cells = patterns.markerSize + 2  # with its frame
+    side = SIDE * step / cells
+    found = []
+    for number, centre in enumerate(edge_markers(*plate.shape) * step):
+        black = cv2.aruco.generateImageMarker(patterns, number, cells) == 0
+        for row, column, length in _runs(black):
+            middle = (column + length / 2 - cells / 2, cells / 2 - row - 0.5)
+            found.append(_box(length * side, side) + centre + np.array(middle) * side)
+    return found
+
+
+def _runs(black: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Yield row, first column and length of each run of black cells."""
+    for row, cells in enumerate(black):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
+        for first, end in edges.reshape(-1, 2).tolist():
+            yield row, first, end - first
 
 
 def _nearest(places: np.ndarray) -> float:

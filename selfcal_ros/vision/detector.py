@@ -2,7 +2,7 @@
 """Mark detections of images: candidates, fits, reasons of rejection, offsets in stage axes."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -45,6 +45,7 @@ class Fault(StrEnum):
     BROKEN = "broken"
     WEAK = "weak"
     DOUBLE = "double"
+    MARKER = "part_of_a_marker"
 
 
 @dataclass(frozen=True)
@@ -245,15 +246,16 @@ class MarkDetector:
                       "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
                       "corner)?")
 
-    def detections(self, marks: Iterable[Mark], shape: tuple[int, ...], stamp_ns: int,
-                   ) -> list[Detection]:
-        """Return the marks of an image of this shape (h, w) as detections."""
+    def detections(self, marks: Sequence[Mark], shape: tuple[int, ...], stamp_ns: int,
+                   ids: Sequence[tuple[int, int] | None] = ()) -> list[Detection]:
+        """Return the marks of an image of this shape (h, w) as detections, with ids if known."""
         out = []
-        for mark in marks:
+        for mark, known in zip(marks, ids or [None] * len(marks), strict=True):
             x, y = offset(mark.u, mark.v, shape, self.settings)
             sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2))
-            out.append(Detection(stamp_ns, int(Kind.GRID), False, 0, 0, 0, x, y, 0.0, sigma,
-                                 mark.score))
+            m, n = known or (0, 0)
+            out.append(Detection(stamp_ns, int(Kind.GRID), known is not None, m, n, 0, x, y, 0.0,
+                                 sigma, mark.score))
         return out
 
 

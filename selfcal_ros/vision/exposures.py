@@ -3,7 +3,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,8 @@ from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError, printable
 from selfcal_ros.messages.to_model import stamp_ns
-from selfcal_ros.vision.detector import Judged, MarkDetector, told_apart
+from selfcal_ros.vision.coded import CodedPlate
+from selfcal_ros.vision.detector import Fault, Judged, Mark, MarkDetector, told_apart
 from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 
 SETTLED = 3
@@ -81,6 +82,7 @@ class ImageDetector:
     def __init__(self, settings: DetectorSettings, where: str = "mark_detector",
                  draw: Draw | None = None) -> None:
         self._detector = MarkDetector(settings, where)
+        self._coded = CodedPlate(settings.aruco, where) if settings.aruco else None
         self.counts = Counts()
         self.problems: Counter[str] = Counter()
         self.draw = draw
@@ -135,7 +137,7 @@ class ImageDetector:
             picture = decode(lambda shape: self._refuse_other((camera, *shape), name))
             if not self._source.agrees(seen := (camera, *picture.values.shape)):
                 raise other_source(self._source.image, seen, name)
-            judged = self._detector.judged(picture)
+            judged, ids = self._identified(self._detector.judged(picture), picture)
         except InputError as error:
             self.counts.refused += 1
             self.problems[str(error)] += 1
@@ -143,7 +145,7 @@ class ImageDetector:
         if self.draw is not None:
             self.draw(name if name != "image" else str(stamp), picture, judged)
         marks, rejected = told_apart(judged)
-        found = self._detector.detections(marks, picture.values.shape, stamp)
+        found = self._detector.detections(marks, picture.values.shape, stamp, ids)
         if not self.counts.marks and not found:
             self._empty = picture
         self._stamps[stamp] = None
@@ -155,6 +157,20 @@ class ImageDetector:
         self.counts.marks += len(found)
         self.counts.rejected.update(rejected)
         return found
+
+    def _identified(self, judged: list[Judged], picture: Picture,
+                    ) -> tuple[list[Judged], list[tuple[int, int] | None]]:
+        """Return the possible marks without parts of markers, and the ids of the marks."""
+        if self._coded is None:
+            return judged, []
+        marks = [each.found for each in judged if isinstance(each.found, Mark)]
+        found = self._coded.identified(marks, picture, mirror=self._detector.settings.mirror)
+        each_id = iter(found)
+        out = []
+        for each in judged:
+            said = next(each_id) if isinstance(each.found, Mark) else None
+            out.append(replace(each, found=said) if isinstance(said, Fault) else each)
+        return out, [known for known in found if not isinstance(known, Fault)]
 
     def _refuse_other(self, image: tuple, name: str) -> None:
         """Refuse an image of another camera or size than the settled one, before it is decoded.

@@ -6,12 +6,15 @@ import sys
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.settings.detector import MARKS, DetectorSettings
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.edge_markers import edge_markers
 from selfcal_ros.vision.detector import MarkDetector
+from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
 
 PLAN = """plan_id: tiny
@@ -58,6 +61,105 @@ def test_marks_are_found_where_they_are_drawn(plan, tmp_path, mark):
     rows = np.array([sorted(row.tolist(), key=lambda at: at[1]) for row in rows])
     wanted = np.stack(np.meshgrid([-100, 0, 100], [-100, 0, 100], indexing="ij"), axis=2)
     assert np.abs(rows - rows.mean(axis=(0, 1)) - wanted).max() < 0.01
+
+
+SEEN = """plan_id: seen
+artifact: {grid_size: [6, 5], grid_pitch: 1.0e-3, angular_count: 0}
+views: [{name: one}]
+"""
+PITCH_PX, IMAGE_PX = 50, 220
+
+
+def photographed(svg, rng, *, turn, centre, mirror):
+    """Return a camera's image of an SVG and the function from plate (mm) to pixel.
+
+    Outlines and texts are drawn turned and shifted by PIL, 16 x 16 points a pixel.
+    """
+    drawn = [np.array([point.split(",") for point in outline[1:].split("L")], dtype=float)
+             for outline in re.search(r'<path d="([^"]*)"', svg)[1].split("Z")[:-1]]
+    marks = np.array([outline.mean(axis=0) for outline in drawn[:30]])  # the first are the marks
+    middle = (marks.min(axis=0) + marks.max(axis=0)) / 2
+
+    def pixel(places):  # of places on the page, mm, y downwards
+        away = (places - middle) * (1, -1) - centre
+        rows = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        across, up = rows @ away.T * PITCH_PX
+        return np.stack([(-across if mirror else across), -up], axis=1) + (IMAGE_PX - 1) / 2
+
+    image = Image.new("L", (IMAGE_PX * FINE,) * 2, 210)
+    draw = ImageDraw.Draw(image)
+    for outline in drawn:
+        draw.polygon([tuple(point) for point in (pixel(outline) + 0.5) * FINE], fill=30)
+    for x, y, size, text in re.findall(
+            r'<text x="([\d.-]+)" y="([\d.-]+)" font-size="([\d.]+)"[^>]*>([^<]*)<', svg):
+        at = pixel(np.array([[float(x), float(y)]]))[0] * FINE
+        draw.text(tuple(at), text, fill=30, font=ImageFont.load_default(
+            float(size) * PITCH_PX * FINE))
+    grey = np.asarray(image, dtype=float).reshape(IMAGE_PX, FINE, IMAGE_PX, FINE)
+    grey = gaussian_filter(grey.mean(axis=(1, 3)), rng.uniform(0.5, 1.5))
+    grey = grey + rng.normal(0, 0.5, grey.shape)
+    return Picture(np.clip(np.round(grey), 0, 255).astype(np.uint8), 255), pixel(marks)
+
+
+def identify(svg, seed):
+    """Check ids and centres in an image that shows a marker, at a random turn, shift and blur."""
+    rng = np.random.default_rng(seed)
+    mirror = bool(rng.integers(2))
+    markers = [(x, y) for x in np.arange(6) - 2.5 for y in (-3, 3)]
+    markers += [(x, y) for x in (-3.5, 3.5) for y in np.arange(5) - 2.0]
+    centre = markers[rng.integers(len(markers))] + rng.uniform(-1.2, 1.2, 2)
+    picture, pixels = photographed(svg, rng, turn=rng.uniform(0, 2 * np.pi), centre=centre,
+                                   mirror=mirror)
+    settings = DetectorSettings.checked({"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4,
+                                         "mirror": mirror, "aruco": "6x5"}, "test")
+    found = ImageDetector(settings).take_picture(picture, 1)
+    inside = np.flatnonzero(((pixels > 15) & (pixels < IMAGE_PX - 16)).all(axis=1))
+    wanted = {(m - 3, n - 2): pixels[m * 5 + n] for m in range(6) for n in range(5)
+              if m * 5 + n in inside}
+    assert all(each.has_id for each in found)
+    told = {(each.m, each.n): each for each in found}
+    assert len(told) == len(found) and wanted.keys() <= told.keys()
+    for mark, (u, v) in wanted.items():
+        x, y = np.array([u, -v]) - np.array([1, -1]) * (IMAGE_PX - 1) / 2
+        at = told[mark].offset_x / 2e-5, told[mark].offset_y / 2e-5
+        assert np.hypot(at[0] - (-x if mirror else x), at[1] - y) < 0.05
+    return len(wanted)
+
+
+def test_a_camera_knows_which_marks_it_sees(tmp_path):
+    """Ids and centres in ten images at any turn, shift and blur, mirrored or not."""
+    pytest.importorskip("cv2")
+    (tmp_path / "seen.yaml").write_text(SEEN)
+    file = tmp_path / "seen.svg"
+    assert main(["plate", str(tmp_path / "seen.yaml"), "-o", str(file), "--aruco",
+                 "--mark-size", "3e-4"]) == 0
+    assert sum(identify(file.read_text(), seed) for seed in range(10)) > 30
+
+
+def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    assert main(["plate", plan, "-o", str(tmp_path / "p.svg"), "--aruco"]) == 2
+    assert "pip install 'selfcal_ros[camera]'" in capsys.readouterr().err
+    settings = {"pixel_size": 1e-5, "mark_size": 3e-4, "aruco": "3x3"}
+    with pytest.raises(InputError, match="OpenCV, which reads the markers, is not installed"):
+        ImageDetector(DetectorSettings.checked(settings, "test"))
+    with pytest.raises(InputError, match="'three' is not the marks along x and y"):
+        ImageDetector(DetectorSettings.checked(settings | {"aruco": "three"}, "test"))
+    with pytest.raises(InputError, match="251 x 251 marks need 1004 markers"):
+        edge_markers(251, 251)
+
+
+def test_rows_and_columns_are_numbered(plan, tmp_path):
+    file = tmp_path / "p.svg"
+    assert main(["plate", plan, "-o", str(file)]) == 0
+    texts = re.findall(r'<text x="([\d.-]+)" y="([\d.-]+)"[^>]*>(-?\d)<', file.read_text())
+    columns, rows = texts[:3], texts[3:]
+    assert [text for _, _, text in texts] == ["-1", "0", "1"] * 2
+    assert np.allclose(np.diff([float(x) for x, _, _ in columns]), 1.0, atol=0.1)
+    assert np.allclose(np.diff([float(y) for _, y, _ in rows]), -1.0)  # n upwards, the page down
+    height = float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', file.read_text())[1])
+    assert all(float(y) < height for y in re.findall(r'<text x="[\d.-]+" y="([\d.-]+)"',
+                                                     file.read_text()))
 
 
 def test_the_file_is_true_to_size(plan, tmp_path, capsys):

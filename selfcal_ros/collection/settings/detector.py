@@ -36,6 +36,9 @@ class DetectorSettings(ManagedSettings):
         0.0, "angle by which the camera's image is turned to lie along the stage axes, "
         "counter-clockwise", "deg", -360.0, 360.0)
     mirror: bool = declared(False, "the image is mirrored: columns run along -x before the turn")
+    aruco: str = declared(
+        "", "marks along x and y of a plate with ArUco markers (selfcal plate --aruco), as in "
+        "11x9: marks beside a marker get its ids; needs OpenCV; empty = none")
     transport: str = declared(
         "raw", "topic of the images: stage/image or stage/image/compressed",
         choices=("raw", "compressed"))

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ids of marks from the ArUco markers at the edge of their plate, by OpenCV."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.errors import InputError
+from selfcal_ros.model.edge_markers import CORNERS, DICTIONARY, SIDE, edge_markers
+from selfcal_ros.vision.detector import Fault, Mark
+from selfcal_ros.vision.images import Picture
+
+AGREE = 0.15
+"""Largest distance of a corner from its place, pitches, at which markers are believed."""
+NEAR = 0.25
+"""Largest distance of a mark from its place on the lattice, pitches."""
+
+
+class CodedPlate:
+    """Knows which marks of a plate are in an image, if one of its markers is.
+
+    Parameters
+    ----------
+    text : str
+        Marks along x and y of the plate, as in ``11x9``.
+    where : str
+        Place of the text, for errors.
+
+    Raises
+    ------
+    InputError
+        If the text cannot be read, or OpenCV is not installed.
+    """
+
+    def __init__(self, text: str, where: str) -> None:
+        found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+        if not found:
+            raise InputError(f"{where}: aruco", f"'{text}' is not the marks along x and y",
+                             "write for example 11x9")
+        try:
+            import cv2  # extra camera
+        except ModuleNotFoundError as error:
+            raise InputError(f"{where}: aruco", "OpenCV, which reads the markers, is not installed",
+                             "pip install 'selfcal_ros[camera]', or leave aruco out") from error
+        self._shape = np.array([int(found[1]), int(found[2])])
+        self._centres = edge_markers(*self._shape.tolist())
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.detectInvertedMarker = True
+        parameters.minMarkerPerimeterRate = 0.01
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        self._reader: Any = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(
+            getattr(cv2.aruco, DICTIONARY)), parameters)
+
+    def identified(self, marks: Sequence[Mark], picture: Picture, *,
+                   mirror: bool) -> list[tuple[int, int] | Fault | None]:
+        """Return the id (m, n) of each mark; None if it is not known, a fault if it is none.
+
+        Parameters
+        ----------
+        marks : sequence of Mark
+            Found in the image.
+        picture : Picture
+            The image.
+        mirror : bool
+            Whether it is mirrored, columns along -x.
+        """
+        values = picture.values[:, ::-1] if mirror else picture.values
+        places = self._places(values, picture.full_scale)
+        if places is None:
+            return [None] * len(marks)
+        last = values.shape[1] - 1
+        pixels = np.array([(last - mark.u if mirror else mark.u) - 1j * mark.v for mark in marks])
+        at, seen = places
+        return [self._id(at(pixel), seen) for pixel in pixels.tolist()]
+
+    def _places(self, values: np.ndarray, full_scale: int) -> Any:
+        """Return the function from pixel to plate, and the markers seen; None without them.
+
+        Pixels are u - iv, places x + iy in pitches: a turn, a scale and a shift, by least squares.
+        """
+        grey = np.ascontiguousarray(np.clip(values * (255.0 / full_scale), 0, 255), dtype=np.uint8)
+        corners, numbers, _ = self._reader.detectMarkers(grey)
+        if numbers is None:
+            return None
+        numbers = np.ravel(numbers)
+        known = numbers < len(self._centres)
+        if not known.any():
+            return None
+        seen = self._centres[numbers[known]]
+        pixels = np.array([np.reshape(each, (4, 2)) for each in corners])[known]
+        pixel = (pixels[..., 0] - 1j * pixels[..., 1]).ravel()
+        place = (seen[:, None] + CORNERS) @ (1, 1j)
+        columns = np.stack([pixel, np.ones_like(pixel)], axis=1)
+        factor, shift = np.linalg.lstsq(columns, place.ravel(), rcond=None)[0]
+        if np.abs(factor * pixel + shift - place.ravel()).max() > AGREE:
+            return None
+        return lambda at: factor * at + shift, seen
+
+    def _id(self, place: complex, seen: np.ndarray) -> tuple[int, int] | Fault | None:
+        at = np.array([place.real, place.imag])
+        if (np.abs(seen - at).max(axis=1) < SIDE / 2 + 0.05).any():
+            return Fault.MARKER
+        index = at + (self._shape - 1) / 2
+        nearest = np.round(index)
+        if np.abs(index - nearest).max() > NEAR or (nearest < 0).any() or (
+                nearest >= self._shape).any():
+            return None
+        m, n = (nearest - self._shape // 2).astype(int).tolist()
+        return m, n
