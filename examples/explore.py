@@ -7,6 +7,8 @@
 # this page with Jupytext in Jupyter, or in VS Code; `python examples/explore.py` runs it as well.
 
 # %%
+from pathlib import Path
+
 import numpy as np
 
 from selfcal_ros.apply import load
@@ -31,10 +33,10 @@ noise: {{sigma_xy: 2.0e-8}}
 cell: {{visit_order: there_and_back}}
 """
 for day in (1, 2):
-    with open(f"day_{day}.yaml", "w") as file:
-        file.write(SIMULATION.format(day=day))
-    main(["simulate", f"day_{day}.yaml", "-o", f"day_{day}"])
-    main(["solve", f"day_{day}", "--quiet", "-o", f"day_{day}.json"])
+    if not Path(f"day_{day}.json").exists():
+        Path(f"day_{day}.yaml").write_text(SIMULATION.format(day=day))
+        main(["simulate", f"day_{day}.yaml", "-o", f"day_{day}"])
+        main(["solve", f"day_{day}", "--quiet", "-o", f"day_{day}.json"])
 
 # %% [markdown]
 # ## Load and look
