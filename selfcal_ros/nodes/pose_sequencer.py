@@ -26,12 +26,12 @@ from selfcal_ros.sessions.sequencing import SequencingSession
 
 
 class CalibrationAction:
-    """Serve run_calibration for a sequencer: one goal at a time.
+    """Serve run_calibration for a sequencer: one goal at a time, none while it is not active.
 
     Parameters
     ----------
     node : ManagedNode
-        The sequencer's node, during activation.
+        The sequencer's node, during configuration.
     session : SequencingSession
         Runs the plan.
     """
@@ -72,9 +72,11 @@ class CalibrationAction:
             self._goal.publish_feedback(feedback)
 
     def _on_goal(self, _: Any) -> GoalResponse:
-        if self._session.ended and not self._taken:
+        active = self._node.state == "active"
+        if active and self._session.ended and not self._taken:
             return GoalResponse.ACCEPT
-        why = ("another one is executed: cancel it, or wait for its end" if self._taken else
+        why = (f"the node is {self._node.state}: activate it first" if not active else
+               "another one is executed: cancel it, or wait for its end" if self._taken else
                f"{self._session.machine.state}: abort the plan first")
         self._node.say(Level.WARN, f"goal rejected while {why}")
         return GoalResponse.REJECT
@@ -160,13 +162,17 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         super().__init__(SequencerSettings, **kwargs)
 
     def configure(self) -> None:
-        """Create the session, with its plan, and the publisher of commands."""
+        """Create the session, with its plan, the publisher of commands, and the action.
+
+        Without a server of the action, a goal would wait for an answer until the activation.
+        """
         command = self.output(names.NEWEST_COMMAND)
         self.session = SequencingSession(
             self.settings, self.ports(lambda _, fields: command(fields)))
+        self._action = CalibrationAction(self, self.session)
 
     def activate(self) -> None:
-        """Subscribe to the companions, offer services and the action."""
+        """Subscribe to the companions, offer services."""
         session = self.session
         self.subscribe_with_age(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS_AS_IT_COMES, session.take_status)
@@ -181,7 +187,6 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
                 ("redo_view", lambda: session.act(machine.redo)),
                 ("skip_view", lambda: session.act(machine.skip))):
             self.service(Trigger, f"~/{name}", lambda request, act=act: act())
-        self._action = CalibrationAction(self, session)
         self.every(TICK_S, self._on_timer)
 
     def _on_command(self, message: Any, is_older: bool) -> None:

@@ -325,6 +325,20 @@ def test_a_second_goal_is_rejected_and_the_first_goes_on(actor):
     assert actor.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
+def test_a_goal_is_rejected_while_the_node_is_not_active(actor, capfd):
+    """Without a server nobody answered it until the node was active again."""
+    actor.node.trigger_deactivate()
+    assert not actor.send().accepted
+    assert "goal rejected while the node is inactive: activate it first" in capfd.readouterr().err
+    actor.node.trigger_activate()
+    first = actor.send()
+    assert first.accepted
+    actor.node.trigger_deactivate()  # the goal in execution goes on afterwards
+    actor.node.trigger_activate()
+    actor.measure_all()
+    assert actor.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
 def test_of_two_goals_that_come_at_once_one_is_rejected(actor):
     """Both were accepted before one was executed, and the result of the first never came."""
     sent = [actor.client.send_goal_async(RunCalibration.Goal()) for _ in range(2)]
