@@ -11,6 +11,7 @@ import sys
 from functools import partial
 
 from selfcal_ros.portable import hold_interrupts
+from selfcal_ros.topics import message_texts
 
 BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
 """Command that builds the messages as well: colcon does not search inside a package."""
@@ -25,11 +26,28 @@ NEEDED = {
 
 
 def missing_ros() -> str:
-    """Return the module of a node missing in this environment, and the remedy; "" if none."""
+    """Return what a node needs and this environment lacks, and the remedy; "" if nothing.
+
+    A module, or a field of a message that was built before the field was added.
+    """
     for name, remedy in NEEDED.items():
         if importlib.util.find_spec(name) is None:
             return f"there is no {name} in this environment; {remedy}"
+    built = importlib.import_module("selfcal_msgs.msg")
+    for name, text in message_texts().items():
+        kind = getattr(built, name, None)
+        known = kind.get_fields_and_field_types() if kind else {}
+        for field in fields_of(text):
+            if field not in known:
+                return (f"the selfcal_msgs in this environment is of another version: its {name} "
+                        f"has no {field}; build it again: {NEEDED['selfcal_msgs']}")
     return ""
+
+
+def fields_of(text: str) -> list[str]:
+    """Return the names of the fields of a .msg file, without its constants."""
+    lines = [line.partition("#")[0].split() for line in text.splitlines() if line.strip()]
+    return [words[1] for words in lines if len(words) > 1 and "=" not in "".join(words)]
 
 
 def begin_node() -> None:

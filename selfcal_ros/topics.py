@@ -4,6 +4,8 @@
 Names are relative: a namespace is put in front.
 """
 
+from pathlib import Path
+
 IMAGE_TOPICS = {"raw": "stage/image", "compressed": "stage/image/compressed"}
 IMAGE_TYPES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
 ENCODER_TOPIC = "stage/joint_states"
@@ -36,3 +38,10 @@ def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
             "durability": "transient_local" if transient_local else "volatile",
             "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
             "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
+
+
+def message_texts() -> dict[str, str]:
+    """Return the .msg file of each message of this package: of the source tree, or installed."""
+    source = Path(__file__).parents[1] / "msg_defs" / "msg"
+    folder = source if source.is_dir() else Path(__file__).parent / "msg_text"
+    return {file.stem: file.read_text() for file in sorted(folder.glob("*.msg"))}

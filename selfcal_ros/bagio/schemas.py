@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from selfcal_ros.messages.cdr import (
     Payloads,
     layout_of,
 )
-from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS, message_texts
 
 OWN = "selfcal_msgs"
 
@@ -52,22 +51,14 @@ NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1"
 """Numpy codes of the basic types."""
 
 
-def _message_folder() -> Path:
-    """Return the folder of the .msg files: installed with the code, or in the source tree."""
-    source = Path(__file__).parents[2] / "msg_defs" / "msg"
-    return source if source.is_dir() else Path(__file__).parents[1] / "msg_text"
-
-
 @cache
 def typestore() -> Typestore:
     """Return this package's messages, and the common types required by the contract."""
     types: dict = {}
     for name, text in COMMON.items():
         types.update(get_types_from_msg(text, name))
-    for file in sorted(_message_folder().iterdir(), key=lambda item: item.name):
-        if file.name.endswith(".msg"):
-            name = file.name.removesuffix(".msg")
-            types.update(get_types_from_msg(file.read_text(), f"{OWN}/msg/{name}"))
+    for name, text in message_texts().items():
+        types.update(get_types_from_msg(text, f"{OWN}/msg/{name}"))
     return _store(types)
 
 

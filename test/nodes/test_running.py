@@ -7,8 +7,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import selfcal_msgs.msg
 
+from selfcal_ros import start
 from selfcal_ros.nodes import running
+from selfcal_ros.topics import message_texts
 
 
 @pytest.fixture
@@ -54,3 +57,28 @@ def test_a_node_that_hangs_when_it_is_to_end_is_ended_and_says_where():
     assert done.returncode == 1
     assert "Timeout" in done.stderr
     assert " in hang" in done.stderr
+
+
+def test_messages_that_were_built_before_a_field_was_added_are_one_line(monkeypatch, capsys):
+    """Else each service call ended with an AttributeError."""
+    assert start.missing_ros() == ""
+    fields = selfcal_msgs.msg.ViewCommand.get_fields_and_field_types()
+    older = {name: kind for name, kind in fields.items() if name != "plan_keys"}
+    monkeypatch.setattr(selfcal_msgs.msg, "ViewCommand", SimpleNamespace(
+        get_fields_and_field_types=lambda: older))
+    monkeypatch.setattr(start, "hold_interrupts", lambda held: None)
+    with pytest.raises(SystemExit) as ended:
+        start.begin_node()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(
+        "selfcal: environment: the selfcal_msgs in this environment is of another version: its "
+        "ViewCommand has no plan_keys; build it again: run `make setup`, or in the workspace "
+        "`colcon build --base-paths src/")
+    monkeypatch.delattr(selfcal_msgs.msg, "ViewCommand")
+    assert "its ViewCommand has no header" in start.missing_ros()
+
+
+def test_the_fields_of_a_message_are_those_that_are_built():
+    for name, text in message_texts().items():
+        assert start.fields_of(text) == [*getattr(
+            selfcal_msgs.msg, name).get_fields_and_field_types()]
