@@ -10,7 +10,8 @@ import pytest
 from test.support.sources import ROOT
 
 WITHOUT = """
-import os, signal, sys
+import os, shutil, signal, sys
+shutil._use_fd_functions = False  # as where os has no dir_fd
 for name in ("fcntl", "termios", "tty", "pty", "resource", "pwd", "grp"):
     sys.modules[name] = None
 for module, names in ((os, ("O_NONBLOCK", "O_NOFOLLOW", "O_CLOEXEC", "sched_getaffinity")),
