@@ -31,6 +31,9 @@ PLAN = {
     "visit_order": "order of the marks in views without their own "
                    "(docs/guides/identifiability.md); default: chosen by the cell",
     "model_terms": "list of TERM or TERM:SIZE to be estimated with the map; default: none",
+    "verify": "RESULT.json whose correction is on while the plan is measured, relative to the plan "
+              "(docs/guides/verify.md); `artifact` and `map` are then those of the result unless "
+              "given; default: no correction is verified",
     "artifact_from": "RESULT.json of the calibration that made the plate known, relative to the "
                      "plan (docs/guides/recheck.md); `artifact` and `map` are then those of the "
                      "result unless given; default: the plate is not known",

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TextIO
 
-from selfcal_ros.cli import solve
+from selfcal_ros.cli import solve, verify
 from selfcal_ros.cli.terminal import add_json, aside
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
@@ -66,6 +66,12 @@ def run(args: argparse.Namespace) -> int:
     finally:
         machine.close()
     desk.end()
+    if plan.verify:
+        parser = argparse.ArgumentParser()
+        verify.configure(parser)
+        verifying = parser.parse_args([plan.verify, str(bag), "--sense", str(cell.sense)])
+        verifying.json = args.json
+        return verify.run(verifying)
     parser = argparse.ArgumentParser()
     solve.configure(parser)
     solving = parser.parse_args([str(bag), "-o", f"{bag}.json", "--sense", str(cell.sense),

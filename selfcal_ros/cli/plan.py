@@ -85,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
     if args.plan_verb == "new":
         return plan_new.run(args)
     plan = read_plan(args.plan)
+    if plan.verify and len(plan.views) == 1:  # of the plate of the map
+        plan = replace(plan, artifact_from=plan.artifact_from or plan.verify)
     if plan.artifact_from:
         return planned(args, _repeated(plan, args.repeats if args.plan_verb == "check" else None))
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)

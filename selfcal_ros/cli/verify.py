@@ -3,23 +3,22 @@
 
 import argparse
 import sys
-from dataclasses import asdict, replace
-from typing import Any
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified
 from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.collection.settings.nodes import SolverSettings
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.estimation.comparison.verification import Fault, Verification, corrected, verify
+from selfcal_ros.estimation.comparison.verification import is_believed, require_correctable
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import CalibrationResult, with_input
+from selfcal_ros.model.result import VERIFICATION, CalibrationResult, with_input
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.verification import verification_sentence, verification_text
+from selfcal_ros.reporting.words.verification import verification_text, with_verification
 from selfcal_ros.results import read_result
 
 
@@ -39,23 +38,22 @@ def run(args: argparse.Namespace) -> int:
     """Solve the bag, compare with the map, and print what the correction does."""
     check_outputs([args.map, args.bag, args.params], [args.plot])
     before = read_result(args.map)
-    if not before.observability.identifiable or not before.verdict.qualified:
-        raise InputError(args.map, "is not qualified, so it is not a map to correct with",
-                         "calibrate again")
+    require_correctable(before, args.map)
     after = _after(args, before)
     with busy("comparing"):
-        found = verify(before, after, names=(args.map, args.bag))
-    believed = _believed(after, found)
-    sentence = verification_sentence(found)
+        after, found = with_verification(before, after, names=(args.map, args.bag))
+    told = after.extra[VERIFICATION]
     if args.plot:
         from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
         from selfcal_ros.reporting.figures.paper import save_picture  # likewise
 
-        save_picture(verification_picture(before, after, found, sentence), args.plot)
-    say(args, verification_text(found), _json(found, sentence, believed))
-    if not believed:
+        save_picture(verification_picture(before, after, found, told["sentence"]),
+                     args.plot)
+    say(args, verification_text(found), told | plain(
+        {"gx": found.gx, "gy": found.gy, "g_theta": found.g_theta}))
+    if not is_believed(after, found):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
-    return int(ExitCode.DONE if found.passed and believed else ExitCode.NOT_QUALIFIED)
+    return int(ExitCode.DONE if told["passed"] else ExitCode.NOT_QUALIFIED)
 
 
 def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:
@@ -72,39 +70,14 @@ def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationRe
         raise InputError(args.bag, f"the recording that {args.map} was computed from, without the "
                          "correction", "measure again with the correction on")
     with busy("solving"):
-        return worded(with_input(_solved(args, before, measurements, solver), source, lost))
+        return worded(with_input(_solved(args, measurements, solver), source, lost))
 
 
-def _solved(args: argparse.Namespace, before: CalibrationResult, measurements: Measurements,
-            solver: Any) -> CalibrationResult:
-    """Return the map by itself; if the views do not identify the stage, by the known plate."""
+def _solved(args: argparse.Namespace, measurements: Measurements,
+            solver: SolverSettings) -> CalibrationResult:
+    """Return the map with the correction on."""
+    options = solver_options(solver, measurements, plate_from=args.map)
     try:
-        if not measurements.artifact_from:
-            try:
-                return calibrate(measurements, solver_options(solver, measurements))
-            except NotIdentifiableError:
-                pass
-        options = solver_options(solver, measurements, plate_from=args.map)
-        return calibrate(measurements, replace(options, plate=corrected(before)))
+        return calibrate_corrected(measurements, options)
     except (WiringError, PlacingError) as error:
         raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
-
-
-def _believed(after: CalibrationResult, found: Verification) -> bool:
-    """Return whether the readings with the correction on may be believed.
-
-    Against a known plate, a stage that is corrected wrongly looks like another plate.
-    """
-    named = found.fault not in (Fault.NONE, Fault.OTHER, Fault.OLDER)
-    other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
-    return after.verdict.qualified or (named and other_plate)
-
-
-def _json(found: Verification, sentence: str, believed: bool) -> dict[str, Any]:
-    return plain({
-        "sentence": sentence, "better": found.better, "passed": found.passed and believed,
-        "fault": str(found.fault), "theta_fault": str(found.theta_fault),
-        "remains": found.remains, "correlation": found.alike,
-        "axes": {name: asdict(axis) for name, axis in found.axes.items()},
-        "remaining": None if found.remaining is None else asdict(found.remaining),
-        "gx": found.gx, "gy": found.gy, "g_theta": found.g_theta})

@@ -226,7 +226,8 @@ class Collector:
         parts = tuple(part for view in readings.values() for part in view.parts)
         return Measurements(timeline.plan_id, timeline.artifact, parts, self.sense,
                             dict(sorted(loose.items())), timeline.run_id,
-                            timeline.model_terms, timeline.artifact_from), progress
+                            timeline.model_terms, timeline.artifact_from,
+                            timeline.verify), progress
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, RejectionFinding]:

@@ -99,7 +99,7 @@ class Command:
     """One view command. `artifact` and `view` are None for DONE and ABORT.
 
     `model_terms` are the terms of the plan to be estimated with the map, as text; `artifact_from`
-    is the result that made the plate known.
+    is the result that made the plate known, `verify` that whose correction is on.
     """
 
     stamp_ns: int
@@ -112,6 +112,7 @@ class Command:
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
     artifact_from: str = ""
+    verify: str = ""
 
     def placed(self) -> View:
         """Return the view of a PLACE or MEASURE.

@@ -141,4 +141,5 @@ class Sequencer:
         if phase in (Phase.DONE, Phase.ABORT):
             return Command(0, phase, plan.plan_id, self.index, views_planned=number)
         return Command(0, phase, plan.plan_id, self.index, plan.views[self.index], plan.artifact,
-                       number, model_terms=plan.model_terms, artifact_from=plan.artifact_from)
+                       number, model_terms=plan.model_terms, artifact_from=plan.artifact_from,
+                       verify=plan.verify)

@@ -72,6 +72,8 @@ class Timeline:
         Terms of the plan to be estimated, from the last MEASURE.
     artifact_from : str
         Result that made the plate known, from the last MEASURE.
+    verify : str
+        Result whose correction is on, from the last MEASURE.
     strays : tuple of Command
         Ignored commands, see `without_strays`.
     """
@@ -87,6 +89,7 @@ class Timeline:
     model_terms: tuple[str, ...] = ()
     strays: tuple[Command, ...] = ()
     artifact_from: str = ""
+    verify: str = ""
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -178,7 +181,7 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
                     tuple(_intervals(ordered, runs, run_id)), planned,
                     ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns,
                     run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms, strays,
-                    newest.artifact_from)
+                    newest.artifact_from, newest.verify)
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
@@ -215,7 +218,7 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
 def _sort_key(command: Command) -> tuple:
     return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index,
             repr(command.view), repr(command.artifact), command.views_planned, command.run_id,
-            command.model_terms, command.artifact_from)
+            command.model_terms, command.artifact_from, command.verify)
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:

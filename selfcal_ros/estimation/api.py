@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.errors import InputError, NotSettledError
+from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.turned import (
     OTHER_LINES,
@@ -16,6 +16,7 @@ from selfcal_ros.estimation.checks.turned import (
     turned_readings,
 )
 from selfcal_ros.estimation.checks.wiring import check_wiring, sign_is_shown
+from selfcal_ros.estimation.comparison.verification import corrected, require_correctable
 from selfcal_ros.estimation.joint.camera import (
     Camera,
     camera_of,
@@ -71,6 +72,9 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         stage (`WiringError`), or the plate is not placed as planned (`PlacingError`).
     """
     options = options or Options()
+    if measurements.verify:
+        raise InputError(f"plan '{measurements.plan_id}'", "was measured with the correction by "
+                         f"{measurements.verify} on", f"selfcal verify {measurements.verify} BAG")
     if options.robust:
         return robust_calibrate(measurements, options)
     check_wiring(measurements)
@@ -101,6 +105,33 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if measurements.has_images:
         result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
     return result
+
+
+def calibrate_corrected(measurements: Measurements, options: Options) -> CalibrationResult:
+    """Return the map of a stage while its correction is on: by itself, or by the known plate.
+
+    Parameters
+    ----------
+    measurements, options
+        As `calibrate` takes them; the known plate is that of the map that is corrected.
+
+    Raises
+    ------
+    InputError
+        If that map is not qualified; else as `calibrate`.
+    """
+    before = options.plate
+    if before is None:
+        raise InputError(f"plan '{measurements.plan_id}'", "no map is named whose correction is on",
+                         "write verify: RESULT.json")
+    require_correctable(before, options.plate_from)
+    readings = replace(measurements, verify="")
+    if not measurements.artifact_from:
+        try:
+            return calibrate(readings, replace(options, plate=None, plate_from="", plate_at=""))
+        except NotIdentifiableError:
+            pass
+    return calibrate(readings, replace(options, plate=corrected(before)))
 
 
 def _agree(result: CalibrationResult) -> bool:

@@ -30,7 +30,7 @@ from selfcal_ros.model.readings import (
     Sense,
     ViewReadings,
 )
-from selfcal_ros.model.view import View, parse_order
+from selfcal_ros.model.view import VERIFY, View, parse_order
 from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
@@ -95,12 +95,14 @@ def command(message: Any) -> Command:
         artifact_of(message) if placed else None,
         views_planned=int(getattr(message, "views_planned", 0)),
         run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message),
-        artifact_from=plate_from(message))
+        artifact_from=plate_from(message), verify=verify_of(message))
 
 
 def refuse_unknown_keys(message: Any, topic: str) -> None:
     """Raise InputError if a ViewCommand or ViewMeasurement has a key of a plan unknown here."""
     for text in getattr(message, "plan_keys", ()):
+        if str(text).startswith(f"{VERIFY}: "):
+            continue
         raise InputError(topic, f"the key {printable(str(text).partition(':')[0])!r} of the plan "
                          "is not known here", "run all nodes in the newer version")
 
@@ -113,6 +115,12 @@ def terms_of(message: Any) -> tuple[str, ...]:
 def plate_from(message: Any) -> str:
     """Return the result that made the plate of a ViewCommand or ViewMeasurement known, or ""."""
     return str(getattr(message, "artifact_from", ""))
+
+
+def verify_of(message: Any) -> str:
+    """Return the result whose correction is on in a ViewCommand or ViewMeasurement, or ""."""
+    keys = (str(text).partition(": ") for text in getattr(message, "plan_keys", ()))
+    return next((value for key, _, value in keys if key == VERIFY), "")
 
 
 def notes_of(message: Any) -> tuple[str, ...]:

@@ -40,7 +40,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
         off the plate's sites (default off the lattice: `default_map_grid`), harmonics of the
         angular map, ``model_terms``, each ``TERM`` or ``TERM:SIZE``, ``check_stops {marks,
         offset}`` (m) of views with grid marks, ``microscope {scale_u, rotation_u, shear_u}`` (u),
-        ``image {nx, ny, pitch_m}``, and ``artifact_from``, which made the plate known.
+        ``image {nx, ny, pitch_m}``, ``artifact_from``, which made the plate known, and ``verify``,
+        the result whose correction is on while the plan is measured.
     where : str
         File name, for messages.
 
@@ -53,7 +54,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
     fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
                             {"visit_order": (str, ""), "model_terms": (list, []),
                              "check_stops": (dict, {}), "microscope": (dict, {}),
-                             "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, "")})
+                             "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, ""),
+                             "verify": (str, "")})
     artifact = replace(artifact_of(fields["artifact"], f"{where}: artifact"),
                        harmonics=harmonics_of(fields["map"], f"{where}: map"))
     order = _order(fields["visit_order"], where)
@@ -81,7 +83,8 @@ def plan_from_dict(data: object, where: str) -> Plan:
                              "give every view its own name")
     terms = terms_of(fields["model_terms"], where)
     return Plan(fields["plan_id"], artifact, views, with_microscope(
-        terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"])
+        terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"],
+        fields["verify"])
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
@@ -181,4 +184,5 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
             **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
             **({"image": dict(vars(image))} if image else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
-            **({"artifact_from": plan.artifact_from} if plan.artifact_from else {})}
+            **({"artifact_from": plan.artifact_from} if plan.artifact_from else {}),
+            **({"verify": plan.verify} if plan.verify else {})}

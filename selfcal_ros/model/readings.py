@@ -228,6 +228,8 @@ class Measurements:
         Terms of the plan to be estimated with the map, see `selfcal_ros.model.terms`.
     artifact_from : str
         RESULT.json of the calibration that made the plate known; empty if it is not.
+    verify : str
+        RESULT.json whose correction was on; empty without one.
     """
 
     plan_id: str
@@ -238,6 +240,7 @@ class Measurements:
     run_id: str = ""
     model_terms: tuple[str, ...] = ()
     artifact_from: str = ""
+    verify: str = ""
 
     @property
     def has_images(self) -> bool:

@@ -43,6 +43,8 @@ from selfcal_ros.model.verdict import (
 from selfcal_ros.outputs import plain
 
 SCHEMA = "selfcal.result/1"
+VERIFICATION = "verification"
+"""Part of a result that was measured with a correction on: what that showed."""
 DIGEST = "digest"
 """Key of the digests of the other keys."""
 WITHOUT_DIGESTS = re.compile(r"(0\.[0-3]\..*)?")

@@ -32,6 +32,8 @@ PLATE_SUFFIX = "@plate"
 """Suffix for lines of the plate's marks: the same marks in the same order in every view. Without
 it lines are those of the stage's sites: the same sites in the same order in every view. Where the
 map has nodes of its own the lines are always the plate's."""
+VERIFY = "verify"
+"""Key of a plan for the result whose correction is on; it travels among the `plan_keys`."""
 DEFAULT_ORDER = "serpentine"
 """Order of a cell if none is specified."""
 
@@ -318,6 +320,8 @@ class Plan:
         Terms to be estimated with the map, see `selfcal_ros.model.terms`.
     artifact_from : str
         RESULT.json of the calibration that made the plate known; empty if it is not.
+    verify : str
+        RESULT.json whose correction is on while the plan is measured; empty without one.
     """
 
     plan_id: str
@@ -325,6 +329,7 @@ class Plan:
     views: tuple[View, ...]
     model_terms: tuple[str, ...] = ()
     artifact_from: str = ""
+    verify: str = ""
 
     @property
     def check_stops(self) -> tuple[int, float]:

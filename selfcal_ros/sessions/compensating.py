@@ -18,7 +18,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
-from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.result import VERIFICATION, CalibrationResult
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, merged
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
@@ -62,6 +62,9 @@ class CompensatingSession:
 
     def _load_file(self, path: str) -> None:
         result = results.read_result(path)
+        if VERIFICATION in result.extra:
+            raise InputError(path, "was measured with the correction on, so it is not a map to "
+                             "correct with", f"name {result.extra[VERIFICATION]['of']}")
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(path, "the map is not qualified", "measure again, or set "
                              "require_qualified to false")
@@ -384,5 +387,10 @@ def read_result(path: str) -> CalibrationResult:
 
 
 def is_qualified(result: CalibrationResult) -> bool:
-    """Return whether the stage error is identified and the readings do not contradict the model."""
+    """Return whether the stage error is identified and the readings do not contradict the model.
+
+    Of a verification: whether the correction passed it.
+    """
+    if VERIFICATION in result.extra:
+        return bool(result.extra[VERIFICATION]["passed"])
     return result.observability.identifiable and result.verdict.qualified

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
@@ -14,7 +14,7 @@ from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
-from selfcal_ros.estimation.api import Options, calibrate, pure_noise
+from selfcal_ros.estimation.api import Options, calibrate, calibrate_corrected, pure_noise
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
 from selfcal_ros.model.pose import without_cell
@@ -23,6 +23,7 @@ from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.verification import with_verification
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
@@ -57,12 +58,22 @@ class Outcome:
 def solve(job: Job) -> Outcome:
     """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
+        if job.measurements.verify:
+            return Outcome(job, _verified(job), None)
         return Outcome(job, _finished(job, calibrate(job.measurements, job.options)), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
         return Outcome(job, _finished(job, result), error)
     except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
+
+
+def _verified(job: Job) -> results.CalibrationResult:
+    """Return the map with the correction on, and what that shows, as `selfcal verify` does."""
+    before = job.options.plate
+    after = _finished(job, calibrate_corrected(job.measurements, job.options))
+    return with_verification(cast(results.CalibrationResult, before), after,
+                             names=(job.options.plate_from, job.measurements.plan_id))[0]
 
 
 def _finished(job: Job, result: results.CalibrationResult) -> results.CalibrationResult:
@@ -211,7 +222,8 @@ class SolvingSession:
         return Measurements(ordered[0].plan_id, artifact, views,
                             to_model.sense_of(ordered[0]),
                             to_model.counts(newest, "session_reject"), self._run.run_id,
-                            to_model.terms_of(newest), to_model.plate_from(newest))
+                            to_model.terms_of(newest), to_model.plate_from(newest),
+                            to_model.verify_of(newest))
 
     def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""
@@ -242,6 +254,8 @@ class SolvingSession:
         if not self._stale or self._incomplete:
             return None
         self._stale = False
+        if self._verifies_later():
+            return None
         stamp = max(map(to_model.stamp_ns, self._messages.values()), default=0)
         try:
             measurements = self.measurements()
@@ -254,6 +268,18 @@ class SolvingSession:
             self._publish_summary()
             raise
         return Job(self._run, measurements, options, digest, stamp, self._notes, self._views_done)
+
+    def _verifies_later(self) -> bool:
+        """Return whether views of a verification are to come: one says less than all."""
+        newest = next(iter(self._messages.values()), None)
+        over = bool(self._ended & {self._run, Run(self._run.plan_id)})
+        if newest is None or not to_model.verify_of(newest) or over or (
+                self._views_done >= self._planned_views(self._run)):
+            return False
+        self.shown = Shown(None, NoDataError("the verification", "views are to come",
+                                             "measure them"), self._run, self._views_done)
+        self._publish_summary()
+        return True
 
     def take(self, outcome: Outcome) -> None:
         """Publish the outcome of a job, unless another run has begun meanwhile."""
@@ -303,11 +329,13 @@ class SolvingSession:
 
     def _publish(self, result: results.CalibrationResult) -> None:
         shown = self.shown
-        if shown.problem is None:
+        of_stage = results.VERIFICATION not in result.extra  # else of what a correction leaves
+        is_map = shown.problem is None and of_stage
+        if is_map:
             self._ports.publish("map", from_model.error_map(
                 result, shown.stamp_ns, self._settings.frame_id) | _verdict(shown))
         self._publish_summary()
-        if shown.problem is None:  # last, as pictures are slow
+        if is_map:  # last, as pictures are slow
             self._ports.publish("markers", {"error_map": result.error_map,
                                             "stamp_ns": shown.stamp_ns})
 

@@ -324,7 +324,8 @@ def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.ran
     for index, view in enumerate(plan.views):
         for phase in (Phase.PLACE, Phase.MEASURE):
             yield Command(now, phase, plan.plan_id, index, view, plan.artifact, len(plan.views),
-                          model_terms=plan.model_terms, artifact_from=plan.artifact_from)
+                          model_terms=plan.model_terms, artifact_from=plan.artifact_from,
+                          verify=plan.verify)
             now += pause_ns
         for event in view_events(truth, plan, index, settings=settings, rng=rng, start_ns=now):
             yield event

@@ -6,7 +6,13 @@ import json
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.cli.main import main
+from selfcal_ros.collection.inputs import Command, Phase
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.messages import from_model
+from selfcal_ros.sessions.solving import SolvingSession, solve
+from test.support.ports import Hands, message, settings_of
 from test.support.verbs import simulate
 
 PLATE = {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 8}
@@ -75,3 +81,45 @@ def test_a_map_of_another_lattice_is_refused(folder, capsys):
                                "views": VIEWS}, noise_seed=2, **MACHINE)
     assert main(["verify", str(folder / "r.json"), str(folder / "small")]) == 2
     assert "the lattices differ: (7, 7) and (5, 5) sites" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("views", "times", "passed"), [
+    (VIEWS, 1, True), (VIEWS[:1], 1, True), (VIEWS[:1], -1, False)])
+def test_a_plan_that_verifies_says_the_same_live(folder, capsys, views, times, passed):
+    name = f"live_{times}_{len(views)}"
+    plan = {"plan_id": name, "verify": str(folder / "r.json"), "artifact": PLATE, "views": views}
+    simulate(folder, name, plan, noise_seed=2, correction={"result": "r.json", "times": times},
+             **MACHINE)
+    capsys.readouterr()
+    assert main(["verify", str(folder / "r.json"), str(folder / name), "--json"]) == 5 * (
+        not passed)
+    told = json.loads(capsys.readouterr().out)["sentence"]
+
+    hands = Hands()
+    session = SolvingSession(settings_of("solver"), hands.ports)
+    measurements, progress, *_ = collect_bag(str(folder / name), CollectorSettings.checked({}, ""))
+    first = progress[0].readings.view
+    planned = Command(int(measurements.run_id), Phase.MEASURE, name, 0, first,
+                      measurements.artifact, len(views), measurements.run_id)
+    session.take_command(message("ViewCommand", from_model.command(planned, "stage")))
+    for index, view in progress.items():
+        session.take_measurement(message("ViewMeasurement", from_model.view_measurement(
+            view, measurements, 10 + index, "stage")))
+        job = session.next_job()
+        assert (job is None) is (index < len(views) - 1)  # it waits for the last view
+    session.take(solve(job))
+    summaries = [fields for output, fields in hands.published if output == "summary"]
+    assert summaries[-1]["state"] == told
+    assert summaries[-1]["qualified"] is passed
+    assert all(output != "map" for output, _ in hands.published)  # nobody corrects by what is left
+
+
+def test_a_bag_of_a_verification_is_not_solved_as_a_calibration(folder, capsys):
+    plan = folder / "verifying.yaml"
+    plan.write_text("plan_id: verifying\nverify: r.json\nviews: [{name: again}]\n")
+    assert main(["plan", "check", str(plan)]) == 0
+    simulate(folder, "verifying", {"plan_id": "v", "verify": str(folder / "r.json"),
+                                   "artifact": PLATE, "views": VIEWS}, noise_seed=2, **MACHINE)
+    capsys.readouterr()
+    assert main(["solve", str(folder / "verifying")]) == 2
+    assert f"selfcal verify {folder / 'r.json'} BAG" in capsys.readouterr().err

@@ -39,20 +39,22 @@ def plan_of(data: object, where: str, folder: Path) -> Plan:
     ----------
     data : object
         As `plan_from_dict` has it; ``artifact`` and ``map`` are those of the result in
-        ``artifact_from`` unless they are given, and ``marks`` may be the name of a CSV.
+        ``artifact_from`` or ``verify`` unless they are given, and ``marks`` may be the name of a
+        CSV.
     where : str
         File name, for messages.
     folder : Path
         Folder in which relative names of results begin.
     """
     data = _with_marks(data, where, folder)
-    if not isinstance(data, dict) or not isinstance(data.get("artifact_from"), str):
+    sources = {key: str((folder / data[key]).resolve()) for key in ("artifact_from", "verify")
+               if isinstance(data, dict) and isinstance(data.get(key), str)}
+    if not sources or not isinstance(data, dict):
         return plan_from_dict(data, where)
-    source = str((folder / data["artifact_from"]).resolve())
     known = {} if "artifact" in data else plan_to_dict(
-        Plan("", read_result(source).plate, ()))
+        Plan("", read_result(next(iter(sources.values()))).plate, ()))
     plate = {key: known[key] for key in ("artifact", "map") if key in known}
-    return plan_from_dict(plate | data | {"artifact_from": source}, where)
+    return plan_from_dict(plate | data | sources, where)
 
 
 def _with_marks(data: object, where: str, folder: Path) -> object:
@@ -100,14 +102,15 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
     """Return the estimator's options in a solver's settings.
 
     If `model_terms` is empty, the terms in the plan of the `measurements` are used; if `plate_from`
-    is, the calibration of the plate that the plan names.
+    is, the calibration that the plan names: the one it verifies, or that of the plate.
 
     Raises
     ------
     InputError
         For invalid terms, or if there is no result of the plate's calibration.
     """
-    plate_from = plate_from or (measurements.artifact_from if measurements is not None else "")
+    if measurements is not None:
+        plate_from = plate_from or measurements.verify or measurements.artifact_from
     reference = _reference(settings, measurements)
     terms, origin = _terms(settings.model_terms, measurements)
     assumed = _assumed(settings)

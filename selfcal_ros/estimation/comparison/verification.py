@@ -151,6 +151,23 @@ class _Maps:
         return values - self.datum @ (self.datum.T @ values)
 
 
+def require_correctable(result: CalibrationResult, where: str) -> None:
+    """Raise InputError unless the map of a result may be corrected."""
+    if not result.observability.identifiable or not result.verdict.qualified:
+        raise InputError(where, "is not qualified, so it is not a map to correct with",
+                         "calibrate again")
+
+
+def is_believed(after: CalibrationResult, found: "Verification") -> bool:
+    """Return whether the readings with the correction on may be believed.
+
+    Against a known plate, a stage that is corrected wrongly looks like another plate.
+    """
+    named = found.fault not in (Fault.NONE, Fault.OTHER, Fault.OLDER)
+    other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
+    return after.verdict.qualified or (named and other_plate)
+
+
 def corrected(result: CalibrationResult) -> CalibrationResult:
     """Return a calibration of a plate whose stage is expected without error, as if corrected."""
     emap = result.error_map

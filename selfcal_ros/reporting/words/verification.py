@@ -2,8 +2,17 @@
 """Sentence and table of what a correction does in the machine."""
 
 import math
+from dataclasses import asdict, replace
 
-from selfcal_ros.estimation.comparison.verification import AxisError, Fault, Verification
+from selfcal_ros.estimation.comparison.verification import (
+    AxisError,
+    Fault,
+    Verification,
+    is_believed,
+    verify,
+)
+from selfcal_ros.model.result import VERIFICATION, CalibrationResult
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.summary.numbers import aligned, significant
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
@@ -28,6 +37,19 @@ _ACTS = {Fault.OFF: "does not act", Fault.SIGN: "has the wrong sign"}
 
 UNIT = {"x": ("µm", UM_PER_M), "y": ("µm", UM_PER_M), "theta": ("arcsec", ARCSEC_PER_RAD)}
 """Unit of an axis in a text, and how many of it are an SI unit."""
+
+
+def with_verification(before: CalibrationResult, after: CalibrationResult, *,
+                      names: tuple[str, str]) -> tuple[CalibrationResult, Verification]:
+    """Return the result with the correction on, with its ``verification``, and what that found."""
+    found = verify(before, after, names=names)
+    passed = found.passed and is_believed(after, found)
+    kept = {"of": names[0], "sentence": verification_sentence(found), "better": found.better,
+            "passed": passed, "fault": str(found.fault), "theta_fault": str(found.theta_fault),
+            "remains": found.remains, "correlation": found.alike,
+            "axes": {name: asdict(axis) for name, axis in found.axes.items()},
+            "remaining": None if found.remaining is None else asdict(found.remaining)}
+    return replace(after, extra={**after.extra, VERIFICATION: plain(kept)}), found
 
 
 def verification_sentence(found: Verification) -> str:
