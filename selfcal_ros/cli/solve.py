@@ -52,13 +52,19 @@ from selfcal_ros.reporting.words.tables import budget_text, validation_json, val
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
+    add_arguments(parser)
+    parser.add_argument("--validate", action="store_true",
+                        help="hold out tenths of the readings and whole views, and predict them")
+
+
+def add_arguments(parser: argparse.ArgumentParser, *, known_plate: bool = False) -> None:
+    """Add what `selfcal solve` and `selfcal recheck` have in common."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
     parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
                         "- is stdout, and other output goes to stderr")
     add_json(parser, "RESULT.json, and the summary on stderr")
-    add_options(parser)
-    parser.add_argument("--validate", action="store_true",
-                        help="hold out tenths of the readings and whole views, and predict them")
+    add_options(parser, known_plate=known_plate)
+    parser.set_defaults(validate=False)
     parser.add_argument("--budget", action="store_true",
                         help="print the uncertainty budget of the map (GUM)")
     parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
@@ -72,14 +78,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "misalignment_model",
           "uncertainty": "uncertainty"}
 REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
-TERMS = {name: name for name in ("drift_degree", "robust")}
+ROBUST = {"robust": "robust"}
 SENSE = {"sense": "measurement_sense"}
 """Options for parameters of solver and collector -> their names."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for collecting and solving a bag."""
-    add_parameters(parser, SolverSettings, METHOD)
+def add_options(parser: argparse.ArgumentParser, *, known_plate: bool = False) -> None:
+    """Add the options for collecting and solving a bag, or a view of a plate that is known."""
+    kept = {"theta_datum": "theta_datum"} if known_plate else METHOD | ROBUST
+    add_parameters(parser, SolverSettings, kept)
+    parser.set_defaults(**dict.fromkeys((METHOD | ROBUST).keys() - kept))
     add_parameters(parser, CollectorSettings, SENSE)
     parser.add_argument("--params", metavar="NODES.yaml",
                         help="ROS parameter file, the same as for the nodes")
@@ -97,7 +105,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
                         help="standard uncertainties of the microscope's scale, rotation (rad) "
                         "and shear (default: 0.01:0.01:0.002)")
-    add_parameters(parser, SolverSettings, TERMS)
     parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
                         "for bags with several cells; / is the root")
 
@@ -106,7 +113,7 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
     """Return the settings of collector and solver; options take precedence over the file."""
     collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
     solver = node_settings(args.params, SolverSettings, model_terms=_model(args),
-                           **given(args, METHOD | REFERENCE | TERMS), **_reference(args.reference))
+                           **given(args, METHOD | REFERENCE | ROBUST), **_reference(args.reference))
     of_plate = {"reference_at"} if getattr(args, "plate_from", "") else set()
     for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":

@@ -74,10 +74,25 @@ def test_a_stage_that_has_changed(folder, capsys):
     assert "Changed since r.json" in (folder / "bent.html").read_text()
 
 
+@pytest.mark.parametrize("option", ["--validate", "--robust", "--method=law",
+                                    "--uncertainty=never"])
+def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["recheck", str(folder / "r.json"), str(folder / "same"), option])
+    assert ended.value.code == 2
+    assert f"the option {option.partition('=')[0]} is unknown" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("option", "where"), [("--validate", "--validate"),
                                                ("--robust", "robust")])
-def test_options_that_need_more_than_one_view(option, where, folder, capsys):
-    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), option]) == 2
+def test_a_plan_of_a_known_plate_refuses_what_needs_more_than_one_view(option, where, folder,
+                                                                       capsys):
+    plan = {"plan_id": "m", "artifact_from": str(folder / "r.json"), "views": [{"name": "again"}]}
+    (folder / "view.yaml").write_text(json.dumps(SEEDS | {"noise_seed": 4, "plan": plan}))
+    if not (folder / "view").exists():
+        assert main(["simulate", str(folder / "view.yaml"), "-o", str(folder / "view")]) == 0
+    capsys.readouterr()
+    assert main(["solve", str(folder / "view"), option]) == 2
     assert f"{where}: the plate is known from {folder / 'r.json'}" in capsys.readouterr().err
 
 
@@ -104,7 +119,7 @@ def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
     (folder / "morning.yaml").write_text(json.dumps(spec))
     bag, one, other = (str(folder / name) for name in ("morning", "one.json", "other.json"))
     assert main(["simulate", str(folder / "morning.yaml"), "-o", bag]) == 0
-    bare = ["--model", "none", "--misalignment", "linear"]
+    bare = ["--model", "none"]
     assert main(["solve", bag, "-o", one, *bare]) == 0
     assert main(["recheck", str(folder / "r.json"), bag, "-o", other, *bare]) == 0
     one, other = read_json(one), read_json(other)

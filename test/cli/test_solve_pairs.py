@@ -30,7 +30,6 @@ FACTORS = {
     "misalignment": ([], ["--misalignment", "linear"], ["--misalignment", "rigid"]),
     "method": ([], ["--method", "law"]),
     "datum": ([], ["--theta-datum", "xy_axes"]),
-    "degree": ([], ["--drift-degree", "1"]),
     "namespace": ([], ["--namespace", "/"]),
     "params": ([], ["--params", "nodes.yaml"]),
     "robust": ([], ["--robust"]),
@@ -196,7 +195,7 @@ def assert_as_asked(data, row):
     bare = linear or row["model"] == 4
     assert {term["name"] for term in data["model"]["terms"]
             if term["source"] != "readings"} == names | (set() if bare else ASSUMED)
-    degrees = {1 if row["degree"] else 2 if row["params"] else 3} if "drift" in given else set()
+    degrees = {2 if row["params"] else 3} if "drift" in given else set()
     assert {sum(item["view"] == "a" and item["component"].startswith("x")
                 for item in term["estimates"])
             for term in data["model"]["terms"] if term["name"] == "drift"} == degrees
