@@ -174,15 +174,14 @@ def run(args: argparse.Namespace) -> int:
     path = Path(args.output)
     cell_path = Path(args.cell) if args.cell else path.with_name("cell.yaml")
     simulation = cell_path.with_name(f"{cell_path.stem}_simulation.yaml")
+    if sys.stdin.isatty():  # before anything is asked
+        _require_new([path, cell_path])
     known = _answers(args)
-    simulated = known.machine == "simulated"
-    outputs = [path, cell_path, *([simulation] if simulated else [])]
-    check_outputs([], outputs)
-    for written in outputs:
-        if written.exists():
-            raise InputError(str(written), "exists already", "remove it or name another file")
     artifact = _artifact(known)
     _require_travel(known, artifact)
+    simulated = known.machine == "simulated"
+    outputs = [path, cell_path, *([simulation] if simulated else [])]
+    _require_new(outputs)
     with late_progress("judging plans") as progress:
         plan = _best(known, artifact, path.stem, lambda: progress(0, None))
         budget = _budget(plan)
@@ -196,6 +195,14 @@ def run(args: argparse.Namespace) -> int:
     say(args, "\n".join(_text(known, plan, (budget, step), outputs)),
         _json(known, plan, (budget, step), outputs))
     return int(ExitCode.DONE)
+
+
+def _require_new(paths: list[Path]) -> None:
+    """Refuse files that cannot be written, or exist."""
+    check_outputs([], paths)
+    for path in paths:
+        if path.exists():
+            raise InputError(str(path), "exists already", "remove it or name another file")
 
 
 def _answers(args: argparse.Namespace) -> Known:

@@ -11,7 +11,7 @@ from selfcal_ros.machine.interface import Image, MachineError, Offset, Placing
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import flicker_noise, quantised
 from selfcal_ros.simulation.machine import Truth, random_truth
-from selfcal_ros.simulation.spec import Simulation, read_simulation
+from selfcal_ros.simulation.spec import Simulation, corrected, read_simulation
 
 LEAST_VIEWS = 64
 """Number of placings that are drawn at least."""
@@ -54,6 +54,8 @@ class SimulatedMachine:
         placing = None if again is None else np.random.default_rng(again)
         self.truth: Truth = random_truth(self._plan.artifact, views, rng, simulation.spread,
                                          placing=placing)
+        if simulation.correction is not None:
+            self.truth = corrected(self.truth, simulation.correction, simulation.correction_times)
         self._position = np.zeros(3)
         self._approach = np.zeros(2)
         self._rested = 0

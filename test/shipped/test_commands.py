@@ -79,6 +79,15 @@ def test_commands_run(page, desk, capsys):
         assert found == code, f"{page.name}: {command}: {error}"
 
 
+def test_the_way_to_a_corrected_machine_is_whole():
+    """All of it is run above, in its order, in one folder."""
+    steps = commands((ROOT / "docs/start/drawing.md").read_text())
+    assert not any(parsed_alone(command) for command, _ in steps)
+    assert [(shlex.split(command)[1], code) for command, code in steps] == [
+        ("plan", 0), ("plan", 2), ("plan", 0), ("plate", 0), ("plate", 0), ("measure", 0),
+        ("history", 0), ("export", 0), ("measure", 0), ("measure", 5)]
+
+
 def test_the_tutorial_is_run_from_its_beginning_to_its_end():
     steps = [command for command, _ in commands((ROOT / "docs/start/tutorial.md").read_text())]
     assert sum(not parsed_alone(command) for command in steps) == 9
