@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motor records of a soft IOC, driven by ophyd's EpicsMotor over Channel Access."""
+
+import multiprocessing
+import os
+import socket
+import subprocess
+import sys
+import types
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+import pytest
+
+from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.machine.measuring import Run
+from selfcal_ros.machine.ophyd import OphydMachine
+from test.machine.test_measuring import away_from
+from test.support.cells import Agreeing, write_cell
+
+for library in ("ophyd", "epics", "caproto"):
+    pytest.importorskip(library, exc_type=ImportError)
+pytestmark = pytest.mark.filterwarnings("ignore")  # of their imports
+IOC = """
+from caproto.ioc_examples.fake_motor_record import FakeMotor
+from caproto.server import PVGroup, SubGroup, run
+
+class Stage(PVGroup):
+    x, y = (SubGroup(FakeMotor, velocity=1e3, precision=6, tick_rate_hz=200.0, prefix=name)
+            for name in "xy")
+
+run(Stage(prefix="stage:").pvdb, interfaces=["127.0.0.1"])
+"""
+
+
+@pytest.fixture
+def ioc(monkeypatch):
+    """Run the IOC on a free port of this machine; processes that are started find it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        monkeypatch.setenv("EPICS_CA_SERVER_PORT", str(free.getsockname()[1]))
+    monkeypatch.setenv("EPICS_CA_ADDR_LIST", "127.0.0.1")
+    monkeypatch.setenv("EPICS_CA_AUTO_ADDR_LIST", "NO")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    running = subprocess.Popen([sys.executable, "-c", IOC])
+    yield
+    running.terminate()
+    running.wait()
+
+
+def measure(folder):
+    """Measure a plan; return the largest error of the map."""
+    from ophyd import EpicsMotor
+
+    beamline = sys.modules["beamline"] = types.ModuleType("beamline")
+    beamline.x, beamline.y = (EpicsMotor(f"stage:{name}", name=name) for name in "xy")
+    cell, simulated = write_cell(folder, camera=True, simulation=(
+        "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
+        "cell: {servo_sigma: 0.0}\n"))
+    machine = OphydMachine("beamline:x", "beamline:y")
+
+    def image():
+        simulated.move_to((*machine.position(), 0.0))
+        return simulated.image()
+
+    machine.place, machine.image = simulated.place, image
+    Run(read_plan(folder / "plan.yaml"), cell, machine, folder / "bag", Agreeing()).measure()
+    away, result = away_from(simulated.truth, folder / "bag")
+    assert result.verdict.qualified
+    return np.abs(away).max()
+
+
+def test_a_plan_is_measured_with_motor_records(ioc, tmp_path):
+    """In a process of its own: the library reads its environment once."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        assert pool.submit(measure, tmp_path).result() < 5e-8
