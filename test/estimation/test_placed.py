@@ -23,7 +23,7 @@ from test.support.truth import simulate_measurements
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
-COUNT = 40
+COUNT = 16
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
