@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command of README and docs is understood, and those that need no cell are run."""
 
-import os
 import re
 import shlex
 from shutil import copytree
@@ -95,11 +94,21 @@ def test_the_tutorial_is_run_from_its_beginning_to_its_end():
         "plan", "simulate", "solve", "cal", "up"}
 
 
+def headings(text: str) -> set[str]:
+    """Return the names by which links reach the headings of a page, as mkdocs makes them."""
+    found = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in found}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_links_lead_to_files(page):
-    for address in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
-        if not address.startswith("http"):
-            assert os.path.exists(page.parent / address), f"{page.name}: {address}"
+def test_links_lead_to_files_and_headings(page):
+    for address, heading in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", page.read_text()):
+        if address.startswith("http"):
+            continue
+        target = page.parent / address if address else page
+        assert target.exists(), f"{page.name}: {address}"
+        if heading:
+            assert heading in headings(target.read_text()), f"{page.name}: {address}#{heading}"
 
 
 def test_what_faq_quotes_is_what_the_code_says():
