@@ -76,7 +76,7 @@ docs: setup  ## the documentation as a site, build/site
 	@PYTHONPATH=build/mkdocs $(BIN)/python -m mkdocs build --quiet
 map3d:  ## the script of the turning map in reports; needs npm
 	@cd tools/map3d && npm ci --silent && npm run --silent build
-reference: setup  ## docs/reference/reference.md from the code
+reference: setup  ## docs/reference/reference.md and config/params/all.yaml from the code
 	@$(BIN)/python tools/reference.py
 sbom: setup  ## sbom.json: pins, hashes, licences
 	@$(BIN)/python tools/sbom.py

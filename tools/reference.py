@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make reference`: the page of that name from code that reads and writes what it describes."""
 
+import json
 import sys
 from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
+
+from yaml import safe_dump
 
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.collection.settings.parameter import Parameter
@@ -13,17 +17,16 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_text
-from selfcal_ros.simulation import spec
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/reference/reference.md"
-SIMULATED = {*spec.PHYSICS, *spec.NOISE, *spec.CELL, "encoder", "rotation"}
-"""Parameters of stage_simulator that are keys of SIM.yaml."""
+PARAMETERS = ROOT / "config/params/all.yaml"
+PARAMETERS_HEAD = """# Every parameter of every node, at its default, SI units; by `make reference`.
+# In brackets the unit, and what is allowed. A file of your own needs only what differs."""
 HEAD = """# Reference
 
-For looking up: keys of PLAN.yaml and RESULT.json, parameters of the nodes, where the messages are
-described. Keys of SIM.yaml: [simulate.md](../guides/simulate.md). SI units. `make reference` writes
-this page.
+For looking up: keys of PLAN.yaml and RESULT.json; where parameters and messages are described. Keys
+of SIM.yaml: [simulate.md](../guides/simulate.md). SI units. `make reference` writes this page.
 """
 PLAN = {
     "plan_id": "name of the plan; a plan has one plate",
@@ -176,32 +179,26 @@ def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[s
     return [(f"`{key}`", words[key]) for key in keys]
 
 
-def value(item: Any) -> str:
-    if isinstance(item, bool):
-        return str(item).lower()
-    return f"{item:g}" if isinstance(item, float) else str(item) or "empty"
+def bounds(p: Parameter) -> str:
+    if p.choices:
+        return " | ".join(map(str, p.choices))
+    return "" if p.low is None or p.high is None else f"{p.low:g} to {p.high:g}"
 
 
-def bounds(limits: dict[str, Any]) -> str:
-    if limits.get("choices"):
-        return ", ".join(map(str, limits["choices"]))
-    low, high = limits.get("low"), limits.get("high")
-    return "" if low is None or high is None else f"{low:g} to {high:g}"
-
-
-def parameter_row(p: Parameter) -> tuple[str, ...]:
-    allowed = f"({bounds(vars(p))})" if bounds(vars(p)) else ""
-    return f"`{p.name}`", " ".join(filter(None, (value(p.default), p.unit, allowed))), p.description
-
-
-def parameters_of_several_nodes() -> list[Parameter]:
-    """Return the parameters that two nodes or more declare alike."""
-    every = [parameter for parameters in NODE_PARAMETERS.values() for parameter in parameters]
-    return list(dict.fromkeys(p for p in every if every.count(p) > 1 and p.name not in SIMULATED))
-
-
-def nodes_with(parameter: Parameter) -> str:
-    return ", ".join(node for node, declared in NODE_PARAMETERS.items() if parameter in declared)
+def parameters_text() -> str:
+    """Return the parameter file with everything that can be set, at its default."""
+    lines = [PARAMETERS_HEAD]
+    for node, parameters in NODE_PARAMETERS.items():
+        lines += ["", f"{node}:", "  ros__parameters:"]
+        for p in parameters:
+            facts = "; ".join(filter(None, (p.unit, bounds(p))))
+            about = f"{p.description} [{facts}]" if facts else p.description
+            lines += [f"    # {line}" for line in wrap(about, 90)]
+            number = isinstance(p.default, int | float) and not isinstance(p.default, bool)
+            # ROS takes a bare y as true; 1e-09 is a number with a point alone
+            default = safe_dump(p.default).split()[0] if number else json.dumps(p.default)
+            lines.append(f"    {p.name}: {default}")
+    return "\n".join(lines) + "\n"
 
 
 def message_rows() -> Iterator[tuple[str, ...]]:
@@ -224,20 +221,11 @@ def text(result: dict[str, Any]) -> str:
                  list(result), RESULT, "RESULT.json")), "",
              "Present only if requested, or if there is something to report:", "",
              *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
-             "## Parameters", ""]
-    shared = parameters_of_several_nodes()
-    lines += ["### several nodes", "", *table(
-        ("parameter", "default (allowed)", "meaning", "nodes"),
-        [(*parameter_row(p), nodes_with(p)) for p in shared]), ""]
-    for node, parameters in NODE_PARAMETERS.items():
-        lines += [f"### {node}", ""]
-        parameters = [p for p in parameters if p not in shared]
-        if node == "stage_simulator":
-            lines += ["Also the keys of `physics`, `noise` and `cell` of SIM.yaml, without the "
-                      "name of their section, and `encoder` and `rotation` of its `truth`.", ""]
-            parameters = [p for p in parameters if p.name not in SIMULATED]
-        lines += [*table(("parameter", "default (allowed)", "meaning"),
-                         map(parameter_row, parameters)), ""]
+             "## Parameters of the nodes", "",
+             "[config/params/all.yaml](../../config/params/all.yaml) has all of them: meaning, "
+             "unit, bounds, default. Copy what differs for your cell into a file of your own, "
+             "which the nodes and `--params NODES.yaml` read; `ros2 param describe` prints the "
+             "same.", ""]
     lines += ["## Messages, services, action", "",
               "Each field has its unit and frame in the definition; `ros2 interface show "
               "selfcal_msgs/msg/ErrorMap` prints it.", "",
@@ -263,8 +251,9 @@ def example() -> dict[str, Any]:
 
 
 def main() -> int:
-    write_text(PAGE, text(example()))
-    print(PAGE.relative_to(ROOT))
+    for path, content in ((PAGE, text(example())), (PARAMETERS, parameters_text())):
+        write_text(path, content)
+        print(path.relative_to(ROOT))
     return 0
 
 

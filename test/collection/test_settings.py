@@ -24,7 +24,6 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import default_terms
-from selfcal_ros.simulation.spec import CELL, NOISE, PHYSICS, TRUTH
 
 EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
@@ -53,31 +52,17 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
             NODE_SETTINGS[node].checked({parameter.name: beyond}, "here")
 
 
-def documented(node):
-    """Return name, and default with unit and bounds, of each parameter in the reference."""
-    page = (Path(__file__).parents[2] / "docs/reference/reference.md").read_text()
-    _, _, section = page.partition("## Parameters")[2].partition(f"### {node}\n")
-    for line in section.partition("\n### ")[0].splitlines():
-        if line.startswith("| `"):
-            name, default, _ = line.strip("| ").split(" | ", 2)
-            yield name.strip("`"), default
-
-
 @pytest.mark.parametrize("node", NODE_PARAMETERS)
-def test_numbers_are_those_of_the_documents(node):
-    shared, own_rows = dict(documented("several nodes")), dict(documented(node))
-    table = shared | own_rows
-    own = [p for p in NODE_PARAMETERS[node]
-           if node != "stage_simulator" or p.name not in {*PHYSICS, *NOISE, *CELL, *TRUTH}]
-    assert list(own_rows) == [p.name for p in own if p.name in own_rows or p.name not in shared]
-    for parameter in own:
-        if type(parameter.default) not in (int, float):
-            continue
-        number, *unit, low, high = re.fullmatch(
-            r"(\S+)(?: ([^(]+?))?(?: \((\S+) to (\S+)\))?", table[parameter.name]).groups()
-        assert (unit[0] or "") == parameter.unit
-        assert float(number) == pytest.approx(parameter.default, rel=1e-5)
+def test_the_file_of_all_parameters_states_their_units_and_bounds(node):
+    text = (Path(__file__).parents[2] / "config/params/all.yaml").read_text()
+    section = re.split(r"^(\w+):$", text, flags=re.M)
+    found = re.findall(r"((?:^    # .*\n)+)    (\w+): ", section[section.index(node) + 1], re.M)
+    about = {name: " ".join(re.findall(r"# (.*)", words)) for words, name in found}
+    for parameter in NODE_PARAMETERS[node]:
+        facts = re.fullmatch(r".*? ?(?:\[([^\[]*)\])?", about[parameter.name])[1] or ""
+        assert facts.startswith(parameter.unit)
         if parameter.low is not None:
+            low, high = facts.rpartition("; ")[2].split(" to ")
             assert (float(low), float(high)) == pytest.approx((parameter.low, parameter.high),
                                                               rel=1e-5)
 
