@@ -131,11 +131,15 @@ def _check(args: argparse.Namespace) -> int:
         put({"passed": code == ExitCode.DONE, "items": items})
     elif code in (ExitCode.DONE, ExitCode.NOT_QUALIFIED):
         wrong = sum(not item["passed"] for item in items)
-        tell(f"{wrong} of {len(items)} checks failed" if wrong else
+        following = sum(bool(item["follows"]) for item in items)
+        tell(f"{wrong} of {len(items)} checks failed" + (
+                 f", {following} of them because of others" if following else "") if wrong else
              f"all {len(items)} checks passed: the cell is ready for a calibration")
     return code
 
 
 def _line(item: dict) -> str:
+    if item["follows"]:
+        return f"      so fails {item['name']}: {item['figure']}"
     remedy = f"\n      {item['remedy']}" if item["remedy"] else ""
     return f"{'pass' if item['passed'] else 'FAIL'}  {item['name']}: {item['figure']}{remedy}"

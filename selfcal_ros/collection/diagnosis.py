@@ -258,7 +258,7 @@ def wrong_joints(e: Evidence) -> str | None:
             return (signs[0] * x + 1j * signs[1] * y) / scale
 
         if _away(e, tried) <= e.limit_m:
-            return _fault_text(scale, swapped=swapped, signs=signs, sense=e.sense)
+            return fault_text(scale, swapped=swapped, signs=signs, sense=e.sense)
     return None
 
 
@@ -270,7 +270,7 @@ def _away(e: Evidence, changed: Callable[[np.ndarray], np.ndarray]) -> float:
     return max(view.away(changed(view.stage)) for view in e.marks) * e.pitch_m
 
 
-def _fault_text(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
+def fault_text(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
     """Return the fault and the remedy for a combination that fits."""
     what, remedy = [], []
     if SCALES[scale]:

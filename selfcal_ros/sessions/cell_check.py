@@ -23,6 +23,7 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.sessions.cell_faults import explaining
 from selfcal_ros.sessions.health import Ports
 from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS
 
@@ -44,6 +45,13 @@ REVISIT_S = 10.0
 """Time within which a cell must revisit a missing mark."""
 OLDEST_S = 10.0
 """Largest age of a detection for a valid stamp of exposure."""
+COVERED = {
+    "detection clock": ("rest", "ids", "marks", "check stops", "signs"),
+    "rest": ("ids", "marks", "check stops", "signs"),
+    "ids": ("rest", "marks", "check stops", "signs"),
+    "marks": ("check stops", "signs"), "check stops": ("signs",),
+    "signs": ("rest", "ids", "marks", "check stops")}
+"""Checks of the readings -> those that fail as well if they fail."""
 MISTAKEN = (Reason.UNKNOWN_MARK, Reason.TOO_FAR, Reason.AMBIGUOUS, Reason.NOT_IN_VIEW,
             Reason.ROTATION, Reason.NOT_AT_MARK)
 """Reasons of rejection related to ids."""
@@ -54,12 +62,34 @@ type Steps[T] = Generator[None, None, T]
 
 @dataclass(frozen=True)
 class CheckItem:
-    """One check: name, whether it passed, figure, remedy."""
+    """One check: name, whether it passed, figure, remedy, and the fault that it follows from."""
 
     name: str
     passed: bool
     figure: str
     remedy: str = ""
+    follows: str = ""
+
+
+def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
+    """Return the items that passed, then each fault with those that follow from it.
+
+    Parameters
+    ----------
+    items : list of CheckItem
+        Checks of the readings, in their order.
+    fault : str
+        Name of the one that tells the fault, "" = the first that failed.
+    """
+    found = [item for item in items if item.passed]
+    failed = sorted((item for item in items if not item.passed),
+                    key=lambda item: item.name != fault)
+    while failed:
+        first, *others = failed
+        covered = [item for item in others if item.name in COVERED.get(first.name, ())]
+        found += [first, *(replace(item, remedy="", follows=first.name) for item in covered)]
+        failed = [item for item in others if item not in covered]
+    return found
 
 
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
@@ -145,8 +175,9 @@ class CellCheck:
         revisited = yield from self._revisited()
         self._send(Phase.DONE)
         yield from self._wait(self._pause_s)
-        self._tell("revisits", revisited, "a mark named as missing was "
-                   + ("seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
+        if revisited is not None:
+            self._tell("revisits", revisited, "a mark named as missing was " + (
+                   "seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
                    "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
                    "marks until the next command; if it cannot, set min_repeats")
         yield from self._old(aborted, measured)
@@ -162,12 +193,12 @@ class CellCheck:
                        "reliable and transient local, act on MEASURE, publish "
                        "stage/mark_detections reliable")
             return None
-        self._send(Phase.ABORT)
+        aborted = self._send(Phase.ABORT)
         self._pause_s = self._longest_pause_s()
         yield from self._wait(self._pause_s)
-        before = len(self._seen)
+        before = len(self._events)
         yield from self._wait(self._pause_s)
-        late = len(self._seen) - before
+        late = self._exposed_since(aborted, before)
         self._tell("abort", not late, f"{late} detections later than {self._pause_s:.3g} s after "
                    "ABORT", "stop measuring when ABORT arrives")
         return command
@@ -188,11 +219,14 @@ class CellCheck:
         self._pause_s = self._longest_pause_s()
         return command
 
-    def _revisited(self) -> Steps[bool]:
-        """Report a mark as missing until it is detected; return whether it was."""
+    def _revisited(self) -> Steps[bool | None]:
+        """Report a mark as missing until it is detected; return whether it was.
+
+        None if no mark was read that could be missing.
+        """
         progress = self._collected()[1]
         if not len(progress.readings.m):
-            return False
+            return None
         before, end = len(self._seen), self._ports.now_s() + REVISIT_S + self._pause_s
         mark = {"missing_m": [int(progress.readings.m[0])],
                 "missing_n": [int(progress.readings.n[0])], "complete": False,
@@ -206,15 +240,23 @@ class CellCheck:
         """Send commands again that the cell has already executed."""
         count = 0
         for command in commands:
-            before = len(self._seen)
+            before, ended = len(self._events), self._command
             self._publish(command)
             yield from self._wait(self._pause_s)
-            count += len(self._seen) - before
+            count += self._exposed_since(ended, before)
             self._send(Phase.ABORT)
             yield from self._wait(self._pause_s)
         self._tell("old commands", not count, f"{count} detections after a finished MEASURE was "
                    "sent again", "remember the stamps of executed commands and do not "
                    "execute them again")
+
+    def _exposed_since(self, command: Command, before: int) -> int:
+        """Return the number of detections exposed after a command: others are in transit.
+
+        Of those received after the first `before` messages.
+        """
+        return sum(isinstance(event, Detection) and event.stamp_ns > command.stamp_ns
+                   for event in self._events[before:])
 
     def _place_and_measure(self, view: View) -> Steps[Command]:
         self._send(Phase.PLACE, view)
@@ -298,32 +340,36 @@ class CellCheck:
         return not missing
 
     def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
-        rejected, used = measurements.all_rejected(), progress.readings.used
-        total = len(self._seen)
+        rejected, total, first = measurements.all_rejected(), len(self._seen), len(self.items)
         ages = [age for _, age, _ in self._seen] or [0]
         age, earliest = (float(value) * S_PER_NS for value in (np.median(ages), min(ages)))
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
+        # whether the stage stood at the marks at these stamps
+        good = progress.readings.used > (total - outside) / 2
         self._tell("detection clock", not outside and age <= OLDEST_S
                    and earliest >= -self._settings.clock_limit,
                    f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the "
-                   "view", "stamp detections at the instant of exposure, by the clock of the "
-                   "joint states")
+                   "view", "publish each detection as soon as it is found" if good else
+                   "stamp detections at the instant of exposure, by the clock of the joint states")
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
         self._tell("rest", not moving, f"{moving} of {total} exposures while the stage moved, or "
                    "without samples around them", REMEDY[Reason.MOVING])
+        bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
+        fault = explaining(self._command, self._events, self._settings) if bad else None
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
         figure = f"{named} of {len(self._seen)} detections name their mark"
         figure += "" if named else ": marks are identified by their positions"
         figure += "".join(f", {count} {reason}" for reason, count in mistaken.items())
         remedy = "; ".join(REMEDY[reason] for reason in mistaken)
-        if mistaken and named and self._used_exchanged() > used + sum(mistaken.values()) / 2:
-            figure = f"m and n are exchanged: {figure}"
-            remedy = "m counts the marks along plate x, n along plate y"
-        self._tell("ids", not mistaken, figure, remedy)
+        if fault is not None:
+            figure, remedy = f"{fault.what} ({figure})", fault.remedy
+        self._tell("ids", not mistaken and fault is None, figure, remedy)
         self._judge_loss(progress, rejected, total)
-        if self._judge_wiring(measurements) and self.view.angular:
+        follows, told = self._judge_wiring(measurements, progress.check_done)
+        if follows and self.view.angular:
             self._judge_theta(progress.readings)
+        self.items[first:] = grouped(self.items[first:], "ids" if fault else "signs" * told)
 
     def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
         others = {reason: count for reason, count in rejected.items() if reason not in MISTAKEN}
@@ -338,17 +384,6 @@ class CellCheck:
                    f"{progress.check_done} of {progress.check_expected} marks from all four sides",
                    "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
                    "(docs/start/cell.md)")
-
-    def _used_exchanged(self) -> int:
-        """Return the number of detections that would be used with m and n exchanged."""
-        other = Collector(self._settings)
-        other.add_command(self._command)
-        for event in self._events:
-            if isinstance(event, EncoderSample):
-                other.add_encoder(event)
-            else:
-                other.add_detection(replace(event, m=event.n, n=event.m))
-        return sum(view.used for view in other.collect()[0].views)
 
     def _judge_theta(self, readings: ViewReadings) -> None:
         """Tell whether the lines show the turn of the plate that the marks show, or its opposite.
@@ -367,8 +402,14 @@ class CellCheck:
                        ": offset_theta has the other sign" if reversed_ else ""),
                    "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise")
 
-    def _judge_wiring(self, measurements: Measurements) -> bool:
-        """Tell whether the offsets follow the stage; return whether they do."""
+    def _judge_wiring(self, measurements: Measurements, stops: int) -> tuple[bool, bool]:
+        """Tell whether the offsets follow the stage; the angle only with check stops.
+
+        Returns
+        -------
+        follows, told : bool
+            Whether they do, and whether they show how they do not.
+        """
         [view] = measurements.views
         faults = [worded(fault) for fault in wiring_faults(measurements)]
         slopes = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
@@ -378,7 +419,7 @@ class CellCheck:
         shown = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
         remedy = "; ".join(error.remedy for error in faults)
-        turned = _turned_deg(view.motion)
+        turned = _turned_deg(view.motion) if stops else None
         if turned is not None and abs(turned) > TURNED_DEG and not (
                 faults and abs(turned) > 180 - TURNED_DEG):
             shown = False
@@ -388,7 +429,7 @@ class CellCheck:
         self._tell("signs", shown and not faults,
                    what or f"offset against stage {figure or 'not known'} (-1 expected)",
                    remedy or "let the stage stop off the marks: check stops")
-        return shown and not faults
+        return shown and not faults, bool(what)
 
 
 def _slope(motion: RepeatMotion | None, axis: int) -> float | None:

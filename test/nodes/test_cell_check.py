@@ -239,13 +239,14 @@ def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):
 @pytest.mark.parametrize(("code", "words", "said"), [
     (0, [], "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n"),
     (0, ["--json"], {"passed": True, "items": [
-        {"name": "rest", "passed": True, "figure": "still", "remedy": ""}]}),
+        {"name": "rest", "passed": True, "figure": "still", "remedy": "", "follows": ""}]}),
     (5, ["--json"], {"passed": False, "items": [
-        {"name": "rest", "passed": False, "figure": "moves", "remedy": "wait"}]}),
+        {"name": "rest", "passed": False, "figure": "moves", "remedy": "wait",
+         "follows": ""}]}),
     (5, [], "FAIL  rest: moves\n      wait\n1 of 1 checks failed\n")])
 def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
     item = {"name": "rest", "passed": not code, "figure": "moves" if code else "still",
-            "remedy": "wait" if code else ""}
+            "remedy": "wait" if code else "", "follows": ""}
 
     @contextmanager
     def child(*_, **__):

@@ -10,7 +10,8 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
-from test.support.independent_cell import IndependentCell, largest_deviation
+from test.support.bench_cell import largest_deviation
+from test.support.independent_cell import IndependentCell
 
 PLAN = """
 plan_id: independent

@@ -49,9 +49,10 @@ from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from selfcal_ros.topics import INPUT_TOPICS
 from selfcal_ros.units import NS_PER_S
+from test.support.bench_cell import largest_deviation
 from test.support.cameras import DETECTS
 from test.support.forked import Forks
-from test.support.independent_cell import IndependentCell, largest_deviation
+from test.support.independent_cell import IndependentCell
 from test.support.killed import Cell
 from test.support.maps import random_map, result_of
 from test.support.ros import Graph

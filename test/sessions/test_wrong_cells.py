@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal cell check` of a machine that shares no code with the package, right and wrong.
+
+Each wrong cell fails; the first line names its fault, and what follows from it is told as such.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.sessions.cell_check import CellCheck, CheckItem, grouped
+from test.support.bench_cell import Bench
+from test.support.ports import Hands, settings_of
+from test.support.sessions import small_plan
+
+TICK_S, PERIOD_S = 0.02, 0.1
+PLACE, MEASURE, DONE, ABORT = range(4)
+
+
+class Cell(Bench):
+    """A bench that is driven without ROS: a stage that stops for 0.1 s at each exposure.
+
+    `fault` is what is wrong with it, in words.
+    """
+
+    def __init__(self, fault, hands, **kwargs):
+        super().__init__(seed=4, **kwargs)
+        self.fault, self.hands, self.check = fault, hands, None
+        self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
+        self.view, self.position, self.late = None, self.home, []  # in transit
+
+    def obey(self, fields):
+        """Act on a command, once."""
+        view = SimpleNamespace(**fields)
+        stamp = fields["header"]["stamp"]
+        stamp = stamp["sec"] * 10**9 + stamp["nanosec"]
+        if stamp <= self.acted or (self.fault == "ignores ABORT" and view.phase == ABORT):
+            return
+        self.acted, self.work = stamp, []
+        if view.phase == PLACE:
+            self.lay()
+        elif view.phase == MEASURE:
+            if self.fault == "another view":
+                view.rotation += np.pi / 2
+            self.view, self.work = view, list(self.exposures(view))
+            self.begun_s = self.hands.seconds
+
+    def see_again(self, fields):
+        """Measure what a status names as missing."""
+        if not self.work and self.view is not None and not fields["complete"]:
+            for m, n in zip(fields["missing_m"], fields["missing_n"], strict=True):
+                self.work += self.stops(self.view, m, n)
+            self.begun_s = self.hands.seconds
+
+    def tick(self):
+        """Publish the encoder, and the detection that is due."""
+        now = self.hands.seconds
+        if self.work and now >= self.begun_s:
+            self.position = self.work[0][0]
+        self.check.take_encoder(self.encoder(now))
+        while self.late and self.late[0][0] <= now:
+            self.check.take_detection(self.late.pop(0)[1])
+        if self.work and now >= self.begun_s + PERIOD_S / 2:
+            _, seen = self.work.pop(0)
+            self.begun_s = now + PERIOD_S / 2
+            self.show(seen, now - TICK_S / 2)
+
+    def encoder(self, now):
+        """Return the sample of the encoder."""
+        x, y, theta = self.position
+        if self.fault == "does not move":
+            x, y, theta = self.home
+        if self.fault == "x and y exchanged":
+            x, y = y, x
+        if self.fault == "millimetres":
+            x, y = 1e3 * x, 1e3 * y
+        if self.fault == "reversed x":
+            x = -x
+        names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
+        return SimpleNamespace(header=self.header(now), name=names, position=[x, y, theta])
+
+    def show(self, seen, seconds):
+        """Publish a detection of an exposure."""
+        seen, before = dict(FIELDS) | seen, self.last
+        self.last = seen
+        if self.fault == "repeats the last detection" and before is not None:
+            seen = before
+        if self.fault == "theta reversed":
+            seen["offset_theta"] *= -1
+        if self.fault.startswith("camera turned"):
+            turned = np.exp(1j * np.deg2rad(float(self.fault.split()[2]))) * (
+                seen["offset_x"] + 1j * seen["offset_y"])
+            seen = seen | {"offset_x": turned.real, "offset_y": turned.imag}
+        if self.fault == "mirrored camera":
+            seen = seen | {"offset_x": -seen["offset_x"]}
+        if self.fault == "offsets in mm":
+            seen = seen | {key: 1e3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "m and n exchanged":
+            seen = seen | {"m": seen["n"], "n": seen["m"]}
+        seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
+        arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
+        self.late.append((arrives, SimpleNamespace(header=self.header(seconds), **seen)))
+
+    def header(self, seconds):
+        stamp = self.hands.now_ns + round((seconds - self.hands.seconds) * 1e9)
+        return SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
+
+
+FIELDS = {"m": 0, "n": 0, "k": 0, "offset_x": 0.0, "offset_y": 0.0, "offset_theta": 0.0,
+          "sigma": 0.0}
+
+
+def checked(fault="", **cell):
+    """Return the items of a check of a cell."""
+    hands = Hands()
+    bench = Cell(fault, hands, **cell)
+    check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
+                                    hands.ports, settle_s=0.2, patience_s=30.0)
+    while not check.done:
+        hands.published.clear()
+        check.tick()
+        for output, fields in hands.published:
+            (bench.obey if output == "command" else bench.see_again)(fields)
+        bench.tick()
+        hands.pass_time(TICK_S)
+    return check.items
+
+
+@pytest.mark.parametrize("cell", [{}, {"ids": False}])
+def test_the_right_cell_passes(cell):
+    assert [item for item in checked(**cell) if not item.passed] == []
+
+
+WRONG = [
+    ("theta reversed", "theta", "offset_theta has the other sign"),
+    ("ignores ABORT", "abort", "detections later than 2 s after ABORT"),
+    ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
+    ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
+    ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
+    ("m and n exchanged", "ids", "m and n are exchanged"),
+    ("x and y exchanged", "ids", "x and y are exchanged"),
+    ("millimetres", "ids", "the indicated positions are 1000 times those of the marks"),
+    ("offsets in mm", "ids", "the offsets are in mm"),
+    ("reversed x", "ids", "x is indicated with the wrong sign"),
+    ("other joints", "joints", "heard a, b, c"),
+    ("old stamps", "detection clock", "stamps 3.003e+04 ms old when they arrive"),
+    ("arrives late", "detection clock", "stamps 1.103e+04 ms old when they arrive"),
+    ("stamped late", "ids", "each detection shows the mark of 1 exposure before its stamp"),
+    ("repeats the last detection", "ids", "each detection shows the mark of 1 exposure before"),
+    ("does not move", "ids", "the stage does not move: it is indicated at x = 0 mm, y = 0 mm"),
+    ("another view", "ids", "the marks are those of a plate turned by 90°")]
+
+
+REMEDIES = {"arrives late": "publish each detection as soon as it is found",
+            "old stamps": "stamp detections at the instant of exposure",
+            "x and y exchanged": "exchange joint_x and joint_y", "reversed x": "reverse the sign"}
+
+
+@pytest.mark.parametrize(("fault", "name", "figure"), WRONG, ids=[fault for fault, *_ in WRONG])
+def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, figure):
+    first, *others = [item for item in checked(fault) if not item.passed]
+    assert (first.name, first.follows) == (name, "")
+    assert figure in first.figure
+    assert first.remedy.startswith(REMEDIES.get(fault, ""))
+    assert first.remedy
+    assert {(item.follows, item.remedy) for item in others} <= {(name, "")}
+
+
+def test_two_publishers_are_the_only_fault():
+    hands = Hands()
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), hands.ports)
+    cell = Cell("", hands)
+    cell.check, check.publishers = check, {"stage/mark_detections": ["camera", "old_camera"]}
+    while not check.done:
+        check.tick()
+        cell.tick()
+        hands.pass_time(TICK_S)
+    [item] = check.items
+    assert (item.name, item.passed) == ("publishers", False)
+    assert item.figure == "2 publishers of stage/mark_detections: camera, old_camera"
+
+
+def test_faults_that_have_nothing_to_do_with_each_other_stand_side_by_side():
+    items = [CheckItem(name, passed, name) for name, passed in (
+        ("rest", True), ("ids", False), ("marks", False), ("signs", False), ("theta", False))]
+    assert [(item.name, item.follows) for item in grouped(items, "signs")] == [
+        ("rest", ""), ("signs", ""), ("ids", "signs"), ("marks", "signs"), ("theta", "")]
+    assert [(item.name, item.follows) for item in grouped(items, "")] == [
+        ("rest", ""), ("ids", ""), ("marks", "ids"), ("signs", "ids"), ("theta", "")]
