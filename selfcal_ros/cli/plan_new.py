@@ -25,7 +25,6 @@ from selfcal_ros.estimation.observability.plan_check import (
 )
 from selfcal_ros.estimation.observability.suggest import (
     Against,
-    Suggestion,
     best_plan,
     rank_next,
     score_plan,
@@ -184,16 +183,14 @@ def run(args: argparse.Namespace) -> int:
     _require_new(outputs)
     with late_progress("judging plans") as progress:
         plan = _best(known, artifact, path.stem, lambda: progress(0, None))
-        budget = _budget(plan)
-        step = _next(plan)
+        found = _budget(plan), _next(plan)
     write_yaml(path, plan_to_dict(plan))
     write_text(cell_path, _cell_text(known, simulation.name))
     if simulated:
         folder = path.resolve().parent
         named = path.name if folder == simulation.resolve().parent else str(path.resolve())
         write_yaml(simulation, _simulation(known, named))
-    say(args, "\n".join(_text(known, plan, (budget, step), outputs)),
-        _json(known, plan, (budget, step), outputs))
+    say(args, "\n".join(_text(known, plan, found, outputs)), _json(known, plan, found, outputs))
     return int(ExitCode.DONE)
 
 
@@ -337,10 +334,11 @@ def _budget(plan: Plan) -> PlanBudget:
     return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
 
 
-def _next(plan: Plan) -> Suggestion:
-    """Return the further view that helps most."""
-    _, ranked = rank_next(plan, against=_against())
-    return next(item for item in ranked if item.view is not None and item.repeat_of is None)
+def _next(plan: Plan) -> tuple[View, float]:
+    """Return the further view that helps most, and by which factor it changes u."""
+    now, ranked = rank_next(plan, against=_against())
+    added = next(item for item in ranked if len(item.views) > len(plan.views))
+    return added.views[-1], added.score.rms_xy / now.rms_xy
 
 
 def _cell_text(known: Known, simulation: str) -> str:
@@ -380,9 +378,9 @@ def _simulation(known: Known, plan: str) -> dict[str, Any]:
     return out
 
 
-def _text(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
+def _text(known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]],
           outputs: list[Path]) -> Iterator[str]:
-    (budget, step), artifact = found, plan.artifact
+    (budget, (further, factor)), artifact = found, plan.artifact
     nx, ny = artifact.shape
     span = " x ".join(f"{(count - 1) * known.pitch * MM_PER_M:g}" for count in artifact.shape)
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in known.travel)
@@ -396,11 +394,9 @@ def _text(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
            f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
            "shows where U comes from")
     yield (f"it takes about {minutes_of(known, plan):.0f} minutes: {_counted_visits(plan, known)}")
-    longer = minutes_of(known, replace(plan, views=step.views)) - minutes_of(known, plan)
-    less = step.score.rms_xy / score_plan(plan, against=_against()).rms_xy
-    assert step.view is not None
-    yield (f"the further view that helps most: {describe_view(step.view, artifact)}; it makes U "
-           f"{1 - less:.0%} smaller and takes {longer:.0f} minutes more")
+    longer = minutes_of(known, replace(plan, views=(further,)))
+    yield (f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
+           f"{1 - factor:.0%} smaller and takes {longer:.0f} minutes more")
     yield f"written: {', '.join(map(str, outputs))}"
     tried = "" if known.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
     yes = " --yes" if known.machine == "simulated" else ""
@@ -408,13 +404,12 @@ def _text(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
            f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}")
 
 
-def _json(known: Known, plan: Plan, found: tuple[PlanBudget, Suggestion],
+def _json(known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]],
           outputs: list[Path]) -> dict[str, Any]:
-    budget, step = found
-    assert step.view is not None
+    budget, (further, _) = found
     theta = budget.u_rms("theta")
     return {"plan_id": plan.plan_id, "written": list(map(str, outputs)),
             "views": [view_to_dict(view, plan.artifact) for view in plan.views],
             "minutes": minutes_of(known, plan), "exposures": _exposures(plan),
             "U_xy": 2 * budget.u_rms("xy"), "U_theta": 2 * theta if known.lines else None,
-            "next_view": view_to_dict(step.view, plan.artifact)}
+            "next_view": view_to_dict(further, plan.artifact)}
