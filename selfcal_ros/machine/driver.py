@@ -12,7 +12,7 @@ from selfcal_ros.errors import SelfcalError
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again, Duty
-from selfcal_ros.machine.interface import Machine, Placing
+from selfcal_ros.machine.interface import Machine, MachineError, Placing
 from selfcal_ros.machine.measuring import place_by_robot
 from selfcal_ros.machine.visiting import Visitor, stops
 
@@ -50,6 +50,7 @@ class Driver:
         self.problem = ""
         self._duty = Duty()
         self._idle_since_ns = 0
+        self._unplaced = False  # the robot has failed, or was stopped
         self._placing = False  # a robot may be at it: MEASURE waits for its end
         self._turn = threading.Condition()  # guards the three below
         self._next: Job | None = None
@@ -60,7 +61,8 @@ class Driver:
     @property
     def busy(self) -> bool:
         """Whether it is placing or visiting."""
-        return self._busy or self._next is not None
+        with self._turn:
+            return self._busy or self._next is not None
 
     def take_command(self, command: Command) -> None:
         """Carry out a new command.
@@ -131,11 +133,16 @@ class Driver:
     def _place(self, command: Command) -> None:
         view = command.placed()
         x, y = view.translation_m
+        self._unplaced = True
         place_by_robot(self._machine, self._cell, Placing(view.name, x, y, view.rotation_rad,
                                                           command))
+        self._unplaced = False
 
     def _measure(self, command: Command, again: Again | None) -> None:
         view, artifact = command.placed(), command.plate()
+        if self._unplaced:
+            raise MachineError("the robot has not placed the plate", f"view '{view.name}'",
+                               "redo_view has it placed again")
         if again is None:
             route = stops(artifact, view, self._cell.sense)
             self._visitor.require(route)
