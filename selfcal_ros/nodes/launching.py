@@ -2,6 +2,7 @@
 """Shared by the launch files: arguments, nodes, and an end with the reason if one cannot start."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,13 @@ from ament_index_python.packages import get_package_share_directory, get_package
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.launch_context import LaunchContext
+from launch.substitution import Substitution
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.machine.cell import Cell, read_cell
 
 SHARED = ("namespace", "params", "plan", "use_sim_time", "log_level", "foxglove")
 """Arguments of all launch files."""
@@ -79,6 +82,24 @@ def refuse_wrong(context: LaunchContext) -> None:
 def text(name: str) -> ParameterValue:
     """Return a launch argument as a string, however YAML would interpret it."""
     return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+class OfCell(Substitution):
+    """What the CELL.yaml of the launch argument ``cell`` states.
+
+    Parameters
+    ----------
+    of : callable (cell)
+        Returns it as text.
+    """
+
+    def __init__(self, of: Callable[[Cell], str]) -> None:
+        super().__init__()
+        self._of = of
+
+    def perform(self, context: LaunchContext) -> str:
+        """Read the file, and return it."""
+        return self._of(read_cell(context.launch_configurations["cell"]))
 
 
 def node(name: str, *parameters: Any, **kwargs: Any) -> Node:

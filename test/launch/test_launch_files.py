@@ -89,6 +89,7 @@ def parameters_of(description, **given: str) -> list[dict]:
     from launch_ros.actions import Node
     from launch_ros.utilities import evaluate_parameters
 
+    once = {"measurement_collector", "pose_sequencer", "cell_driver"}  # other with a cell
     found = []
     for path in FILES:
         context = LaunchContext()
@@ -96,7 +97,9 @@ def parameters_of(description, **given: str) -> list[dict]:
             argument: "" for arguments in ARGUMENTS.values() for argument in arguments}
             | {"rate": "1.0", "use_sim_time": "false"} | given)
         for entity in description(path).entities:
-            if isinstance(entity, Node) and entity.node_package == "selfcal_ros":
+            if (isinstance(entity, Node) and entity.node_package == "selfcal_ros"
+                    and not (entity.node_executable in once and entity.condition
+                             and not entity.condition.evaluate(context))):
                 rows = [row for row in entity._Node__parameters if isinstance(row, dict)]
                 found.append({key: value for row in evaluate_parameters(context, rows)
                               for key, value in row.items()})
@@ -111,5 +114,21 @@ def test_a_name_like_a_date_or_a_number_stays_text(description, name):
 
 def test_simulated_time_is_for_every_node(description):
     rows = parameters_of(description, use_sim_time="true")
-    assert len(rows) == sum(len(nodes - {"foxglove_bridge"}) for nodes in STARTED.values())
+    assert len(rows) == sum(len(nodes - {"foxglove_bridge", "cell_driver"})
+                            for nodes in STARTED.values())
     assert all(row["use_sim_time"] is True for row in rows)
+
+
+@pytest.mark.parametrize(("sense", "placing"), [("plate_moves", "person"),
+                                                ("microscope_moves", "robot")])
+def test_collector_and_sequencer_are_told_what_the_cell_states(
+        description, tmp_path, sense, placing):
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(f"machine: simulated\nsimulated: {{simulation: sim.yaml}}\nsense: {sense}\n"
+                    f"placing: {placing}\nlimits: {{x: [-1, 1], y: [-1, 1], theta: [-7, 7]}}\n")
+    rows = parameters_of(description, cell=str(cell))
+    assert [row["cell"] for row in rows if "cell" in row] == [str(cell)]
+    assert [row["measurement_sense"] for row in rows if "measurement_sense" in row] == [sense]
+    assert [row["auto_confirm"] for row in rows if "auto_confirm" in row] == [placing == "robot"]
+    assert not any({"measurement_sense", "auto_confirm"} & row.keys()
+                   for row in parameters_of(description))
