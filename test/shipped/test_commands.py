@@ -3,6 +3,7 @@
 
 import re
 import shlex
+from importlib.util import find_spec
 from shutil import copytree
 
 import pytest
@@ -34,6 +35,8 @@ def commands(text: str) -> list[tuple[str, int]]:
 
 def parsed_alone(command: str) -> bool:
     words = command.split()
+    if words[1] == "report" and command.count(".pdf") and not find_spec("weasyprint"):
+        return True  # nothing prints here
     return any(command.startswith(f"selfcal {verb}") for verb in ONLY_PARSED) or any(
         word in PLACES or word[0] == "$" for word in words)
 
