@@ -9,6 +9,7 @@ import numpy as np
 
 from selfcal_ros.collection.diagnosis import (
     AT_LEAST,
+    MOST,
     PLACED,
     Evidence,
     RejectionFinding,
@@ -108,7 +109,7 @@ class DetectionsSeen:
                  ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
-        Ids of a plate of another size are named for the session, however few were rejected.
+        Ids of a plate of another size are named for the session if they are most of those rejected.
 
         Parameters
         ----------
@@ -147,7 +148,8 @@ class DetectionsSeen:
                     used: int) -> RejectionFinding | None:
         """Return that the ids are those of a plate with more or fewer rows; None if not."""
         unknown = rejected.get(Reason.UNKNOWN_MARK, 0)
-        plate, outside = self.artifact, unknown >= AT_LEAST
+        bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
+        plate, outside = self.artifact, unknown >= AT_LEAST and unknown > MOST * bad
         asked = _asked(plate, [view.view for view in views.values() if view.view.grid])
         parts = [part for view in views.values() for part in view.parts]
         unread = [whole.difference(*(np.unique(getattr(part, axis)).tolist() for part in parts))
@@ -169,9 +171,8 @@ class DetectionsSeen:
             return None
         (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in found), plate.shape)
         exchanged = " (the sides are exchanged)" if sides == (ny, nx) else ""
-        total = used + sum(count for reason, count in rejected.items() if reason in REMEDY)
         return RejectionFinding(
-            Reason.UNKNOWN_MARK, unknown, total,
+            Reason.UNKNOWN_MARK, unknown, used + bad,
             f"the ids are those of {sides[0]} x {sides[1]} marks (m {m}, n {n}), not of "
             f"{nx} x {ny}{exchanged}; correct grid_size in the plan, or the ids")
 

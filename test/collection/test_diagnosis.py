@@ -382,6 +382,17 @@ def test_a_plate_of_the_declared_size_is_not_suspected(text):
         assert not any("the ids are those" in found for found in findings(events).values())
 
 
+def test_few_stray_ids_among_other_rejections_are_no_other_plate():
+    """All others have no ids: the strays alone would be a plate of one mark."""
+    cell = scene(plan_of("0, 90, tx", 7, repeats=2), with_ids=False)
+    for index in range(0, len(cell.detections) - 1, 9):
+        cell.spoil(index, **({"has_id": True, "m": 9999} if index % 2 else {"score": 1e-3}))
+        cell.spoil(index + 1, score=1e-3)
+    rejected = gathered(cell.events).collect()[0].all_rejected()
+    assert 5 <= rejected["unknown_mark"] < rejected["low_score"]
+    assert findings(cell.events) == {}
+
+
 def test_the_cause_of_many_rejections_is_stated_with_a_result():
     assert rejections({"unknown_mark": 10, "duplicate": 500, "stage_moving": 99}, 90) == []
     assert rejections({"low_score": 4, "unknown_mark": 8}, 90) == [
