@@ -306,7 +306,7 @@ def test_a_notebook_shows_the_picture_and_text_shows_the_state(result):
     stage = StageMap(result)
     assert repr(stage).startswith(f"<StageMap {result.plan_id}: Good: error up to ")
     page = stage._repr_html_()
-    assert page.startswith("<div") and page.count("<svg") == 1 and "fill=\"#" in page
+    assert page.startswith("<div") and page.count("<svg") == 1 and 'fill="#' in page
 
 
 def test_two_maps_differ_as_diff_says(result):
