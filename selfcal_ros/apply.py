@@ -288,7 +288,7 @@ def _library(name: str) -> ModuleType:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise InputError(name, "not installed", f"pip install {name}") from error
+        raise InputError(error.name or name, "not installed", f"pip install {name}") from error
 
 
 def _along(cover: np.ndarray, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:
