@@ -23,6 +23,9 @@ from selfcal_ros.model.view import View
 from selfcal_ros.parallel import check_workers, outcomes
 
 PITCH_M, SIGMA_M, SIGMA_RAD, SIZE_M, TURN_RAD = 0.01, 20e-9, 2e-6, 0.3e-6, 1e-4
+BEND_M = 5e-9
+"""Bending of the plate in each view, at the middle of an edge: what is assumed of it."""
+
 LENGTH = 0.3
 """Correlation length of a smooth change, as a part of the width of the field."""
 
@@ -78,7 +81,9 @@ class Machine:
         mark, phase = (m + 1j * n) * PITCH_M, view.pose.phase
         spline = MapSpline.of(artifact.field, Interpolation.BICUBIC if artifact.map_grid
                               else Interpolation.BILINEAR)
-        seen = phase * np.exp(1j * phi) * (mark + self.plate[inside]) - phase * mark
+        x, y = mark.real / np.abs(mark.real).max(), mark.imag / np.abs(mark.imag).max()
+        bent = np.stack([x**2, 2 * x * y, y**2], axis=-1) @ complex_normal(rng, (3,), BEND_M)
+        seen = phase * np.exp(1j * phi) * (mark + self.plate[inside] + bent) - phase * mark
         seen += spline.rows(view.pose.places(artifact, m, n)) @ spline.coefficients(
             self.field).ravel()
         seen += complex_normal(rng, (), 3e-6) + complex_normal(rng, m.shape, SIGMA_M)

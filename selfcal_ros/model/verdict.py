@@ -195,8 +195,8 @@ class TermResult:
     """A term of the model with its estimates.
 
     `size` is the given one, None if the term was free; `size_used` the larger one of the
-    solution if the readings contradict it, else None. `source` is the origin of the term:
-    ``declared``, ``default``, or ``readings``, which show it.
+    solution if the readings contradict it or make it doubtful, else None. `source` is the origin
+    of the term: ``declared``, ``default``, or ``readings``, which show it.
     """
 
     name: str

@@ -155,7 +155,9 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     found = json.loads(capsys.readouterr().out)["budget"]
     assert (found["sigma_m"], found["sigma_rad"]) == (20e-9, pytest.approx(math.radians(1e-3)))
     lines = {line["component"]: line for line in found["lines"]}
-    assert list(lines) == ["reading noise", "microscope", "plate_strain"]
+    assert list(lines) == ["reading noise", "microscope", "plate_shape", "plate_strain"]
+    assert lines["plate_shape"]["removal"]["text"].startswith(
+        "add an unturned view shifted by -1 pitch along X")
     microscope = lines["microscope"]
     assert (microscope["quantity"], microscope["u"], microscope["source"]) == (
         "xy", 0.01, "default")
@@ -187,7 +189,8 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
 def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp_path):
     out = tmp_path / "next.yaml"
     assert main(["plan", "suggest", shipped("qiao"), "--placing", "0.02deg", "--stage-error",
-                 "10um", "--sigma", "1nm", "--json", "-o", str(out)]) == 0
+                 "10um", "--sigma", "1nm", "--against", "plate_shape:1e-12", "--json", "-o",
+                 str(out)]) == 0
     first = json.loads(capsys.readouterr().out)["suggestions"][0]
     assert first["text"] == "add check_stops: {marks: 5, offset: 20e-6}"
     assert (first["view"], first["visit_order"]) == (None, None)

@@ -6,17 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.readings import Measurements, Sense, subset
+from selfcal_ros.model.view import Plan, View
 from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth, Waves
 from tools.reality.cases import (
     ARTIFACT,
+    MODEL,
     SETTINGS,
     SIGMA_M,
     Case,
     Change,
+    Spoil,
+    bent,
     checked,
     hu,
     resistant,
@@ -30,7 +34,7 @@ WITHOUT_LINES = Artifact(ARTIFACT.grid_size, ARTIFACT.grid_pitch_m, 0)
 def machine_cases() -> list[Case]:
     """Return the cases, those of the microscope first."""
     return [*_wired(), *_scaled(), *_plates(), *_stages(), *_noises(), *_laid(), *_exact(),
-            *_checked()]
+            *_checked(), *_hardly_told()]
 
 
 def _checked() -> list[Case]:
@@ -227,3 +231,65 @@ def _exact() -> list[Case]:
     five = {"plan": resistant()}
     return [_case("nothing, and no noise", settings=exact),
             _case("nothing, and no noise, five views", settings=exact, more=five)]
+
+
+def _hardly_told() -> list[Case]:
+    """Return cases of which the readings determine a part, or few readings the size."""
+    few, small = _seven_lines(), Artifact(5, 0.01, 24)
+    any_pose = {"spread": replace(MODEL, correlation_pitches=3.0), "plan": _any_pose(),
+                "settings": SERVO}
+    eccentric = {"settings": SETTINGS, "line_eccentricity_rad": 15e-6}
+    return [
+        *(Case(f"plate bent in each view, {1e9 * size_m:g} nm, six views", plan=_six(3),
+               change=bent(size_m)) for size_m in (10e-9, 40e-9)),
+        *(Case(f"views at any pose, encoders err by {1e9 * size_m:g} nm in each 20 um",
+               change=subdivided(20e-6, size_m), **any_pose) for size_m in (20e-9, 30e-9)),
+        Case("views at any pose", **any_pose),
+        Case("views at any pose, one mark read in one of them", spoil=with_one_mark, **any_pose),
+        _case("circle of 7 lines off the axis by 15 urad in each view", more={"plan": few},
+              **eccentric),
+        *(Case(f"5 x 5 marks, one pass, noise of 20 nm declared as {1e9 * u_m:g} nm",
+               plan=hu_plan(small, 1), spoil=declaring(u_m)) for u_m in (20e-9, 17e-9, 14e-9)),
+        _case("lines without noise", settings=replace(SERVO, sigma_theta_rad=0.0)),
+        _case("lines without noise, five views", more={"plan": resistant()},
+              settings=replace(SERVO, sigma_theta_rad=0.0))]
+
+
+def _six(repeats: int) -> Plan:
+    """Return Hu's views, one shifted along y and one turned by 180 deg."""
+    plan, pitch = hu(repeats), ARTIFACT.grid_pitch_m
+    return replace(plan, views=(
+        *plan.views, View("shift_y", 0.0, (0.0, pitch), True, True, repeats),
+        View("rot180", np.pi, (0.0, 0.0), True, True, repeats)))
+
+
+def _seven_lines() -> Plan:
+    """Return Hu's views of a plate with seven lines, which a turn by 90 deg does not show."""
+    plan = hu_plan(Artifact(11, 0.01, 7), 5)
+    return replace(plan, views=tuple(
+        replace(view, angular=False) if view.name == "rot90" else view for view in plan.views))
+
+
+def _any_pose() -> Plan:
+    """Return six views turned and shifted by no multiples, on 9 x 9 marks."""
+    plate = Artifact(9, 0.01, 0, map_grid=MapGrid(9, 0.01))
+    poses = ((0, 0, 0), (33, 2, -3), (71, -4, 1), (118, 3, 4), (203, -2, -4), (290, 5, 2))
+    return Plan("any_pose", plate, tuple(
+        View(f"at_{turn}", float(np.deg2rad(turn)), (x * 1e-3, y * 1e-3), True, False, 5)
+        for turn, x, y in poses))
+
+
+def with_one_mark(readings: Measurements, rng: np.random.Generator) -> Measurements:
+    """Leave one mark of the last view."""
+    view = readings.views[-1]
+    left = np.arange(len(view.m)) == len(view.m) // 2
+    return replace(readings, views=(
+        *readings.views[:-1], subset(view, left, np.zeros(len(view.k), dtype=bool))))
+
+
+def declaring(u_m: float) -> Spoil:
+    """Return what spoils readings: they declare a noise of `u_m`."""
+    def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
+        return replace(readings, views=tuple(
+            replace(view, u=np.full(len(view.m), u_m)) for view in readings.views))
+    return spoil

@@ -137,10 +137,11 @@ def fit_model(problem: Problem,
               check: Callable[[TermEquations], None] = lambda equations: None) -> ModelFit:
     """Return the joint least-squares solution of the whole model.
 
-    A term's size that the readings rule out would bend the map with nothing to show it: the fit is
-    repeated with the largest size that they allow. A term that all views share comes first if it
-    explains all by itself: marks that turn against lines as a microscope of another scale turns
-    them are no plates that moved between both.
+    A term's size that is too small would bend the map with nothing to show it: if the readings make
+    it doubtful, the fit is repeated with the largest size that they allow. A term that all views
+    share, or a turn of lines, comes first if it explains all by itself: marks that turn against
+    lines as a microscope of another scale turns them are not plates that moved between both, nor
+    bent ones.
 
     Parameters
     ----------
@@ -156,21 +157,23 @@ def fit_model(problem: Problem,
     """
     model = settled(problem, check)
     sizes = _size_tests(model, problem.terms)
-    if not any(test.contradicted for test in sizes):
+    if not any(test.raised for test in sizes):
         return replace(model, sizes=sizes)
     for term in problem.terms:
-        alone = _size_tests(model, [term] if term.block.shared else [])
+        first = term.block.shared or term.block.between
+        alone = _size_tests(model, [term] if first else [])
         if any(test.contradicted for test in alone):
             simpler = settled(_raised(problem, alone), check)
             rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
             if not any(test.contradicted for test in rest):
-                return replace(simpler, sizes=(*alone, *rest))
+                sizes = (*alone, *rest)
+                break
     return replace(settled(_raised(problem, sizes), check), sizes=sizes)
 
 
 def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
-    """Return the problem with the sizes that the readings allow where they contradict them."""
-    allowed = {test.name: test.allowed for test in sizes if test.contradicted}
+    """Return the problem with the sizes that the readings allow where they make them doubtful."""
+    allowed = {test.name: test.allowed for test in sizes if test.raised}
     return replace(problem, terms=tuple(
         term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
         for term in problem.terms))
@@ -179,9 +182,9 @@ def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
 def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ...]:
     """Return the tests of the sizes of terms; of one that only the map contradicts the finer's."""
     tests = _tests_of(model, terms)
-    if not any(test.contradicted for test in tests) or (fine := finer(model)) is None:
+    if not any(test.raised for test in tests) or (fine := finer(model)) is None:
         return tests
-    instead = {test.name: test for test in _tests_of(fine, terms) if not test.contradicted}
+    instead = {test.name: test for test in _tests_of(fine, terms) if not test.raised}
     return tuple(instead.get(test.name, test) for test in tests)
 
 

@@ -18,7 +18,7 @@ from selfcal_ros.blocks import Block, block_of
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.fit import JointFit, Moving, angular_part, fit
-from selfcal_ros.estimation.joint.problem import ROUNDING, Problem, grid_dof, sigma_of
+from selfcal_ros.estimation.joint.problem import FLOOR, ROUNDING, Problem, grid_dof, sigma_of
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     TermEquations,
@@ -156,7 +156,8 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
         part = OF_NOISE if number < LATE else OF_NOISE_LATE
-        if stuck and (change <= ROUGH_RESOLUTION * largest or state.within_noise(change, part)):
+        if stuck and (change <= max(ROUGH_RESOLUTION * largest, FLOOR)
+                      or state.within_noise(change, part)):
             return state.finished()
         if change > DIVERGES * peak:
             break
@@ -289,8 +290,10 @@ class _State:
         total, dof = _of_lines(self.problem, self.found, equations, inverse, inverse @ now.total)
         if sums.dof_between - dof < FEW_DOF or total > sums.between:
             total, dof = 0.0, 0.0
+        residuals = sigma_of(sums.between - total, sums.dof_between - dof)
+        rounded = residuals[0] == 0  # the weight of nearly exact lines leaves nothing else
         self.problem = replace(
-            self.problem, residuals_xy=sigma_of(sums.between - total, sums.dof_between - dof),
+            self.problem, residuals_xy=self.problem.residuals_xy if rounded else residuals,
             repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
             else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0

@@ -24,6 +24,9 @@ LEAST_DOF = 0.5
 """Degrees of freedom of residuals below which they are rounding: terms with sizes leave fractions
 of one, however small."""
 
+DECLARED_DOF = 8.0
+"""Degrees of freedom of a declared noise: it is known to a quarter (GUM G.4.2)."""
+
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
@@ -45,9 +48,10 @@ class NoiseEstimate:
     ----------
     sigma : float
         Standard deviation of one reading behind the uncertainties; NaN if unknown. If repeats
-        (or the declaration) and residuals contradict each other it is the larger one.
+        (or the declaration) and residuals contradict each other it is the larger one. A declared
+        noise is that of declaration and residuals together, if that is larger.
     dof : float
-        Its degrees of freedom; infinite if the detections declare it.
+        Its degrees of freedom.
     repeats, residuals : float
         The two estimates, NaN if none.
     dof_repeats, dof_residuals : float
@@ -132,7 +136,10 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
         dof_repeats=repeats[1], dof_residuals=residuals[1], declared=declared, p=p)
     if found.contradicted:
         sigma, dof = max(base, residuals)
-        found = replace(found, sigma=sigma, dof=dof)
+        return replace(found, sigma=sigma, dof=dof)
+    if np.isfinite(declared):
+        both, dof = pooled(((declared, DECLARED_DOF), residuals))
+        return replace(found, sigma=max(declared, both), dof=dof)
     return found
 
 
@@ -151,8 +158,12 @@ ROUNDING = 16 * np.finfo(float).eps
 FLOOR = 1e-13
 """Noise, m or rad, that is rounding and not tested."""
 
-LEAST_NOISE_RAD = 1e-10
-"""Noise of lines that counts in weights at least: less is rounding."""
+LEAST_NOISE_RAD = 1e-9
+"""Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all
+that is assumed."""
+
+LEAST_PART = 1e-3
+"""The same as a part of the noise of marks, at the half width."""
 
 NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 """Noise that stands for none: its square is still a number."""
@@ -315,7 +326,8 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
         return 1.0
     sigma_xy = max(sigma_xy, LEAST_NOISE_M, ROUNDING * float(np.abs(y).max()))
     peak = float(np.abs(problem.angular.y).max())
-    sigma_theta = max(sigma_theta, LEAST_NOISE_RAD, ROUNDING * peak)
+    sigma_theta = max(sigma_theta, LEAST_NOISE_RAD, ROUNDING * peak,
+                      LEAST_PART * sigma_xy / problem.half_width_m)
     return bounded_ratio(problem.system, sigma_xy, sigma_theta, problem.half_width_m)
 
 

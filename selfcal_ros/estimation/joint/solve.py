@@ -259,7 +259,7 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
         return ()
     columns, covariance = model.equations.columns.columns, model.covariance
     told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
-    given = {test.name: test.given for test in model.sizes if test.contradicted}
+    given = {test.name: test.given for test in model.sizes if test.raised}
     out = []
     for term in model.problem.terms:
         estimates = tuple(

@@ -176,6 +176,11 @@ class NormalEquations:
         return u[:, s > 1e-6]
 
     @property
+    def hides_fields(self) -> bool:
+        """Whether undetermined misalignments may change the map beyond its datum."""
+        return bool(self.unseen.shape[1])
+
+    @property
     def apart(self) -> bool:
         """Whether no angular view shares its rotation with a grid view.
 

@@ -29,6 +29,9 @@ CORE = 0.75
 VAGUE = 1e-13
 """Information on every node, relative to the mean, that keeps the factorisation alive."""
 
+UNMOVED = 1e-6
+"""Change of a node by a misalignment of unit length up to which it is rounding."""
+
 LOOSE = 10.0
 """Standard uncertainty of an undetermined field, in units of the noise of one reading."""
 
@@ -181,11 +184,23 @@ class PlacedEquations(NormalEquations):
         return self.grid
 
     @cached_property
+    def hides_fields(self) -> bool:
+        """Whether a misalignment that no reading determines changes the map beyond its datum.
+
+        The rotation of a view with a single mark does not.
+        """
+        views = self.grid.views
+        gauge = Gauge(views.z_sites, np.ones(views.shape, dtype=bool), scale=True)
+        fields = (self.grid.response @ self.unseen[:3 * self.grid.n_views]).T
+        return any(np.abs(gauge.remove(field, gauge.parts(field))).max() > UNMOVED
+                   for field in fields.reshape(-1, *views.shape))
+
+    @cached_property
     def known_sites(self) -> np.ndarray:
         """Nodes whose standard uncertainty is below `KNOWN` readings' noise, bool (cx, cy)."""
         views = self.grid.views
         some = (self.grid.components.of_site >= 0).reshape(views.shape)
-        if self.unseen.shape[1]:
+        if self.hides_fields:
             return np.zeros(views.shape, dtype=bool)
         ratio = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
         inverse = self.inverse(ratio) if ratio else self.grid_inverse

@@ -149,7 +149,7 @@ def _nodes_known(system: NormalEquations) -> bool:
     Nothing separates the modes that they determine badly from those that they do not determine, so
     that each node counts by its uncertainty (method, views at any pose).
     """
-    return bool(not system.unseen.shape[1] and system.known_sites.mean() >= DETERMINED
+    return bool(not system.hides_fields and system.known_sites.mean() >= DETERMINED
                 and angular_deficiency(system) == 0)
 
 

@@ -23,6 +23,10 @@ from selfcal_ros.model.terms import ModelTerm
 SIZE_LEVEL = 5e-4
 """Level of the test of each size."""
 
+DOUBT_LEVEL = 0.1
+"""Level below which the readings make a size doubtful, and a larger one is used instead: its upper
+limit with as much confidence, which is far above what few coefficients show."""
+
 BISECTIONS = 60
 """Steps, on a logarithmic scale, to find a size to rounding."""
 
@@ -41,8 +45,9 @@ class SizeTest:
     given : float
         Its size, SI unit of the term; the largest one of a microscope.
     shown, allowed : float
-        The size shown by the readings, and the largest that they allow (the upper one of two limits
-        with a coverage of 95.45 %); the given size if they do not contradict it.
+        The size shown by the readings, and the largest that they allow: the upper one of two limits
+        with a coverage of 95.45 % if they contradict the given size, the limit of `DOUBT_LEVEL` if
+        they make it doubtful; otherwise the given size.
     statistic : float
         b' (C + size^2 1)^-1 b; `rank` on average.
     rank : int
@@ -51,7 +56,7 @@ class SizeTest:
         Probability of as large a value if the size is right.
     evidence : float
         Logarithm of how much likelier the readings are with the size that they show (ratio of
-        marginal likelihoods); 0 if they do not contradict the given one.
+        marginal likelihoods); 0 if they do not make the given one doubtful.
     """
 
     name: str
@@ -67,6 +72,11 @@ class SizeTest:
     def contradicted(self) -> bool:
         """Whether the readings rule out the size as too small."""
         return self.p < SIZE_LEVEL
+
+    @property
+    def raised(self) -> bool:
+        """Whether the readings make the size doubtful, or rule it out: a larger one is used."""
+        return self.p < DOUBT_LEVEL
 
 
 def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
@@ -99,7 +109,7 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
     found = statistic(term.size)
     p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
     test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p)
-    if not test.contradicted:
+    if not test.raised:
         return test
     # b'b / (size^2 the smallest eigenvalue) is not below it
     beyond = np.sqrt(values @ values / np.linalg.eigvalsh(of_size)[0])
@@ -111,7 +121,8 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
             low, high = (middle, high) if statistic(middle) > level else (low, middle)
         return high
 
-    shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - TAIL)))
+    tail = TAIL if test.contradicted else DOUBT_LEVEL
+    shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
     wider = np.linalg.slogdet(spread(shown))[1] - np.linalg.slogdet(spread(term.size))[1]
     return replace(test, shown=shown, allowed=allowed,
                    evidence=float(found - statistic(shown) - wider) / 2)
@@ -144,7 +155,7 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
 
 def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
                noise: tuple[float, float]) -> tuple[SizeTest, ...]:
-    """Return the tests of all sizes, contradicted ones first, in the order of their evidence.
+    """Return the tests of all sizes, raised ones first, in the order of their evidence.
 
     Each is tested with the preceding terms at the sizes that the readings allow, so that one term
     does not make others appear too small.
@@ -162,7 +173,7 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         return ()
     while sized:
         tests = [size_test(equations, right, term, noise) for term in sized]
-        failed = [test for test in tests if test.contradicted]
+        failed = [test for test in tests if test.raised]
         if not failed:
             return (*found, *tests)
         worst = max(failed, key=lambda test: test.evidence)

@@ -9,12 +9,13 @@ taken.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
@@ -23,19 +24,23 @@ from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_sho
 from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.joint.finer import is_untested
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.problem import NoiseEstimate
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations, free_inverse
-from selfcal_ros.estimation.verdict.roughness import NAME as LACK_OF_FIT
+from selfcal_ros.estimation.terms.sizes import DOUBT_LEVEL
+from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
     is_searched,
     search_causes,
 )
 from selfcal_ros.estimation.verdict.uncertainty import (
+    LACK_OF_FIT,
+    Effect,
     budget_lines,
     enlarged,
     enlargements,
@@ -63,6 +68,9 @@ HIDDEN = 1e-3
 FITTED = 0.5
 """Ratio of the fitted to the assumed standard uncertainty of the microscope's scale below which
 the readings have determined it."""
+
+LACK_LEVEL = 0.02
+"""Two-sided level from which residuals beyond the scatter of repeats count as lack of fit."""
 
 UNEXPLAINED = 1.5
 """Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which
@@ -110,14 +118,17 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
         "u_relative": reference.u_relative, "certificate": reference.certificate,
         **({"certified": reference.certified} if reference.certified else {}),
         **({"marks": [*map(list, reference.marks)]} if reference.marks else {})})
-    result = with_coverage(enlarged(result, searched.effects))
+    effects = [*searched.effects, *_beyond_repeats(solved)]
+    result = with_coverage(enlarged(result, effects))
     bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)
     grade = (Grade.GOOD if not (failed or noises or causes) else
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
              Grade.NOT_QUALIFIED)
+    shown = [*((cause.name, cause.unit) for cause in causes),
+             *((LACK_OF_FIT, noise.unit) for noise in noises)]  # else a line of the budget alone
     verdict = Verdict(grade, (*failed, *noises), causes, enlargements(result, searched.terms, [
-        effect for effect in searched.effects if effect.name != LACK_OF_FIT
-        or (LACK_OF_FIT, effect.unit) in [(cause.name, cause.unit) for cause in causes]]))
+        effect for effect in effects if effect.name not in (ROUGHNESS, LACK_OF_FIT)
+        or (effect.name, effect.unit) in shown]))
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
         result, verdict=verdict,
@@ -127,6 +138,51 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
                                           excluded=_excluded(solved, result, options)))
+
+
+def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
+    """Yield what residuals have beyond the scatter of repeats, each map's, as its lack of fit.
+
+    It does not average out: it is met in full at every place, with a sign of its own. That of the
+    view with the most counts: sites that all views share hide it.
+    """
+    if solved.model is None:
+        return
+    emap, found, system = solved.result.error_map, solved.model.found, solved.model.problem.system
+    shape = emap.gx.shape
+    size_m = _lack_of_fit(solved.xy, system.grid.weight, abs(found.residuals))
+    if size_m:
+        sign = 1 - 2 * (np.indices(shape).sum(axis=0) % 2)
+        each = np.where(emap.valid, sign * size_m, 0.0)
+        yield Effect(LACK_OF_FIT, np.stack([each, each]), np.zeros(len(emap.g_theta)))
+    size_rad = _lack_of_fit(solved.theta, system.angular.weight, found.residuals_theta)
+    if size_rad:
+        yield Effect(LACK_OF_FIT, np.zeros((2, *shape)),
+                     np.where(np.isfinite(emap.g_theta), size_rad, 0.0))
+
+
+def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray) -> float:
+    """Return the most that one mean has beyond noise, m or rad; 0 if residuals leave no doubt.
+
+    By the upper limit of the residuals of each view, with the confidence of a doubtful size.
+
+    Parameters
+    ----------
+    noise : NoiseEstimate
+        Noise of the readings.
+    weight, residuals : float arrays (views, ...)
+        Weights and residuals of the readings.
+    """
+    known = np.nanmax([noise.stated, noise.repeats, 0.0])
+    if not (noise.p < LACK_LEVEL and noise.residuals > known):
+        return 0.0
+    each = weight.reshape(len(weight), -1)
+    squares = (each * residuals.reshape(each.shape) ** 2).sum(axis=1)
+    share = (each > 0).sum(axis=1) / (each > 0).sum()
+    dof = noise.dof_residuals * share
+    largest = noise.residuals**2 * squares / squares.sum() * noise.dof_residuals / chdtri(
+        dof, 1 - DOUBT_LEVEL)
+    return float(np.sqrt(max(largest.max() - known**2, 0.0) / each[each > 0].mean()))
 
 
 def _excluded(solved: Solved, result: CalibrationResult,
@@ -328,6 +384,8 @@ def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[Bud
     more = [ModelTerm(block.name, block.nominal) for block in blocks().values()
             if block.nominal and not (block.sizes or block.part_of or block.name in known)
             and (visited or not block.needs_visits)]
+    if not more:
+        return ()
     columns = term_columns(problem.ground, (*problem.terms, *more))
     equations = equations_of(problem, model.found, columns)
     held, lines = model.covariance, []

@@ -60,6 +60,9 @@ determine fully is ignored."""
 MAX_JOINED = 4
 """Largest number of terms added to the model because the readings show them."""
 
+SURELY = 1e-6
+"""Probability below which a term is there beyond doubt: not by chance in a million sessions."""
+
 
 @dataclass(eq=False)
 class SearchResult:
@@ -115,6 +118,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
               if test.contradicted and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
+    found.bounded &= not any(_beyond_u(solved, test) for test in tests)
     plausible = all(test.allowed <= block_of(test.name).plausible for test in tests)
     between = any(block_of(name).between for name in raised)
     alike = between and _as_a_microscope(found, measurements, options)
@@ -337,6 +341,17 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     largest = max(term.estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
                  largest.view, details={"given": test.given})
+
+
+def _beyond_u(solved: Solved, test: SizeTest) -> bool:
+    """Return whether a term is surely there, and what no reading determines of it exceeds u."""
+    term = next(term for term in solved.result.model.terms if term.name == test.name)
+    if not test.p < SURELY or test.rank == len(term.estimates):
+        return False
+    emap = solved.result.error_map
+    whole = {"m": rms(np.stack([emap.u_gx, emap.u_gy])), "rad": rms(emap.u_g_theta)}
+    return any(2 * part.u_rms**2 > whole[part.unit]**2
+               for part in enlargements(solved.result, [term.name], []))
 
 
 def _as_a_microscope(found: SearchResult, measurements: Measurements, options: Options) -> bool:

@@ -29,6 +29,10 @@ TOLD = 0.5
 """Share of a term's size left by the readings below which they determine the term (type A)."""
 
 
+LACK_OF_FIT = "lack_of_fit"
+"""Name of the effect of what residuals have beyond the scatter of repeats."""
+
+
 @dataclass(frozen=True, eq=False)
 class Effect:
     """Effect of a cause on the maps, stage frame.
@@ -87,8 +91,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     emap, extra = result.error_map, dict(result.extra)
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
-    placed = result.plate.map_grid is not None and emap.gx.size <= MAX_SITES
-    if (KEY in extra or placed) and result.noise.sigma_xy > 0:
+    if emap.gx.size <= MAX_SITES and result.noise.sigma_xy > 0:
         kept = extra.get(KEY, {"terms": [], "factors": []})
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
         extra[KEY] = {**kept, "terms": [*kept["terms"], *(effect.name for effect in effects)],
@@ -292,9 +295,10 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     if not (np.isfinite(sigma) and sigma > 0):
         return BudgetLine(kind, "reading noise", "A", 0.0, 0.0, unit, 0.0, 0.0, np.inf, "readings")
     dof = _dof(noise, kind)
-    by = "residuals" if sigma == residuals else "repeats" if sigma == repeats else "declared"
+    by = ("residuals" if sigma == residuals else "repeats" if sigma == repeats else
+          "declared" if sigma == getattr(noise, f"sigma_{kind}_declared") else "together")
     return BudgetLine(
-        kind, "reading noise", "A" if np.isfinite(dof) else "B", 0.0, sigma, unit, rms(u),
+        kind, "reading noise", "B" if by == "declared" else "A", 0.0, sigma, unit, rms(u),
         float(np.nanmax(u)), dof, "declared" if by == "declared" else "readings",
         {"by": by, "contradicted": bool(p < F_LEVEL)})
 

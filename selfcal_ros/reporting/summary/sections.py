@@ -99,7 +99,7 @@ def terms_section(result: CalibrationResult) -> Section:
             continue  # part of the camera, or a line of the budget
         how = "free" if term.size is None else f"size {term.size:g}"
         if term.size_used is not None:
-            how += f", contradicted: {term.size_used:.2g} used"
+            how += f", too small: {term.size_used:.2g} used"
         for item in term.estimates:
             scale, unit = unit_of(term.name, item.unit)
             value, u = item.value * scale, item.u * scale

@@ -7,14 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from selfcal_ros.errors import printable
-from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
 _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
-           "declared": "declared by the detections"}
+           "declared": "declared by the detections",
+           "together": "declared by the detections, and residuals of the fit"}
 
 OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
               "plate temperature": "temperature of the plate now, and its expansion coefficient, "
@@ -84,8 +85,10 @@ def line_text(line: BudgetLine) -> str:
     if "given" in of:
         given = f"size {of['given']:.3g}, " + (
             "of which the readings" if of["allowed"] is None else
-            f"which the readings contradict; of {of['allowed']:.3g}, which they allow, they")
+            f"too small for the readings; of {of['allowed']:.3g}, which they allow, they")
         return f"{given} leave {of['remaining']:.0%}"
+    if of.get("cause") == LACK_OF_FIT:
+        return "residuals beyond the scatter of repeats, met in full at every place"
     if "cause" in of:
         return f"effect of the cause '{of['cause']}' that the readings show (see the verdict)"
     if "runs" in of:

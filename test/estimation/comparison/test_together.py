@@ -11,6 +11,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.together import together
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.solved import KEY
+from selfcal_ros.estimation.terms import sizes
+from selfcal_ros.estimation.verdict import judge
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
@@ -19,7 +21,10 @@ from test.estimation.terms.test_dense_fit import both, measured
 
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
+    """What else noise may be, and doubt, have their own tests."""
     monkeypatch.setattr(solve, "MAX_SITES", 0)
+    monkeypatch.setattr(sizes, "DOUBT_LEVEL", sizes.SIZE_LEVEL)
+    monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
 
 def saved(result):

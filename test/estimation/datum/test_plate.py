@@ -59,10 +59,10 @@ def test_each_reading_adds_what_it_does_to_the_plate(kind, sense):
 
 @pytest.mark.parametrize("sense", Sense)
 def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
-    """With declared noise, and steps too small to contradict it: then no weight changes."""
+    """With declared noise, more than residuals show: then no weight changes."""
     whole, options, power = readings(sense, lines=8), linear(), 0.0
     whole = replace(whole, views=tuple(replace(
-        view, u=1e-8 / np.sqrt(view.count), u_theta=1e-6 / np.sqrt(view.count_theta))
+        view, u=1.5e-8 / np.sqrt(view.count), u_theta=1.5e-6 / np.sqrt(view.count_theta))
         for view in whole.views))
     least = replace(options, uncertainty=False)
     centre = calibrate(whole, least).artifact_map.a_theta

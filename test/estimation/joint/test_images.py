@@ -169,11 +169,14 @@ def population(image_m: float, size: int, runs: int, **settings):
     return np.array(away), results
 
 
-def within(away: np.ndarray, independent: int) -> None:
-    """Assert that about 95.45 % lie within 2 u; `independent`: numbers that a run has."""
+def within(away: np.ndarray, independent: int, *, least: float = 0.9) -> None:
+    """Assert that about 95.45 % lie within 2 u; `independent`: numbers that a run has.
+
+    And that u is not larger than the errors over `least`.
+    """
     n = len(away) * independent
     assert binom.ppf(1e-4, n, 0.9545) <= (np.abs(away) < 2).mean() * n
-    assert 0.9 < np.sqrt((away**2).mean()) < 1.1
+    assert least < np.sqrt((away**2).mean()) < 1.1
 
 
 def away_of(truth, camera) -> np.ndarray:

@@ -58,8 +58,11 @@ def test_declared_noise_is_held_against_the_residuals():
     found = noise_estimate((5e-8, 400), (2e-8, 60), 1e-8)
     assert found.contradicted and found.sigma == 2e-8 and found.dof == 60
     fine = noise_estimate((5e-8, 400), (1.05e-8, 60), 1e-8)
-    assert not fine.contradicted and fine.sigma == 1e-8 and fine.dof == np.inf
-    assert fine.k == pytest.approx(2.0, abs=1e-4)
+    assert not fine.contradicted and fine.dof == 68  # a declaration counts as eight
+    assert fine.sigma == pytest.approx(1e-8 * np.sqrt((8 + 60 * 1.05**2) / 68))
+    smaller = noise_estimate((5e-8, 400), (0.95e-8, 60), 1e-8)
+    assert not smaller.contradicted and smaller.sigma == 1e-8
+    assert noise_estimate((NAN, 0), (NAN, 0), 1e-8).k == pytest.approx(2.37, abs=0.01)
 
 
 def test_nothing_to_compare_is_no_contradiction():

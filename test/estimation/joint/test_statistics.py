@@ -258,8 +258,11 @@ class TestNoise:
         declared = replace(readings, views=tuple(
             replace(view, u=np.full(len(view.m), 1e-8)) for view in readings.views))
         found = calibrate(declared, BARE)
-        assert found.noise.sigma_xy == pytest.approx(1e-8)
-        assert np.sqrt(np.mean(found.error_map.u_gx**2)) == pytest.approx(0.89e-8, rel=0.02)
+        of = found.noise  # eight degrees of freedom, with those of the residuals
+        squares = 8 * 1e-8**2 + of.dof_xy_residuals * of.sigma_xy_residuals**2
+        assert of.sigma_xy == pytest.approx(np.sqrt(squares / (8 + of.dof_xy_residuals)))
+        assert np.sqrt(np.mean(found.error_map.u_gx**2)) == pytest.approx(
+            0.89 * found.noise.sigma_xy, rel=0.02)
 
 
 def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():

@@ -228,7 +228,7 @@ def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly(bend_m
         emap = found.error_map
         away.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
         turned.append(turns(truth, found.extra["camera"]))
-    within(np.array(away), 20)
+    within(np.array(away), 20, least=0.85)  # u has the largest size that the readings allow
     within(np.array(turned), 20)
 
 

@@ -116,10 +116,11 @@ def test_the_lines_have_a_budget_of_their_own():
 def test_a_removal_leaves_what_it_says():
     plan = plan_of("0, 90, tx", 7, repeats=2)
     assumed = Assumed(1e-9, turn_rad=3e-4)
-    found = budget_of(plan, default_terms(), assumed)
+    terms = tuple(term for term in default_terms() if term.name != "plate_shape")  # costs most
+    found = budget_of(plan, terms, assumed)
     removal = found.removals["xy", "microscope"]
     assert removal.kind == "check_stops"
-    with_it = budget_of(replace(plan, views=removal.step.views), default_terms(), assumed)
+    with_it = budget_of(replace(plan, views=removal.step.views), terms, assumed)
     assert removal.effect_rms == pytest.approx(effects(with_it)["microscope"], rel=1e-9)
     assert removal.effect_rms < module.REMOVED * effects(found)["microscope"]
     # strain of its own in each view is told by no single view more

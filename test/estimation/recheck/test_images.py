@@ -37,6 +37,7 @@ def sessions(image_m, seed, *, size=7, turn=0, repeats=1, change=0.0, missing=0.
         **{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread))
     settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense)
     later = replace(truth, t_m=truth.t_m[2:], phi_rad=truth.phi_rad[2:],
+                    plate_shape_m=truth.plate_shape_m[2:],
                     g=truth.g + change * rng.normal(size=truth.g.shape))
     return later, *(simulate_measurements(one, its, rng, settings=settings, missing=missing)
                     for one, its in ((truth, plan), (later, again)))
@@ -120,7 +121,7 @@ def population(image_m, runs, **settings):
     """Return (error / u) of the new map and of the change in every run, and the results."""
     away, changes, results = [], [], []
     for seed in range(runs):
-        later, before, after = sessions(image_m, seed, **settings)
+        later, before, after = sessions(image_m, seed, plate_shape_m=5e-9, **settings)
         first = calibrate(before)
         result = calibrate(after, Options(plate=first, plate_from="r.json"))
         emap, told = result.error_map, result.extra["recheck"]
@@ -144,7 +145,7 @@ def require_within(away: np.ndarray) -> None:
     (0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}),
     (1.0, {"repeats": 2, **DISTORTED})])
 def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
-    away, changes, results = population(part * MARK, 6, **settings)
+    away, changes, results = population(part * MARK, 12, **settings)
     assert all(result.verdict.qualified for result in results)
     require_within(away)
     require_within(changes)

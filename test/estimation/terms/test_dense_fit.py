@@ -11,6 +11,8 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms import sizes
+from selfcal_ros.estimation.verdict import judge
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms, parse_terms
@@ -33,7 +35,7 @@ MODELS = {
 MACHINE = Spread(
     microscope_rotation_rad=4e-3, microscope_scale=-5e-3,
     microscope_shear=5e-4, microscope_stretch=3e-4, backlash_x_m=20e-9, backlash_y_m=-15e-9,
-    plate_scale=3e-7, plate_shape_m=20e-9, plate_strain=1e-7, line_eccentricity_rad=3e-6,
+    plate_scale=3e-7, plate_shape_m=4e-9, plate_strain=1e-7, line_eccentricity_rad=3e-6,
     drift_linear_m=40e-9, drift_quadratic_m=30e-9)
 PARTS = {"microscope": ("microscope_rotation_rad", "microscope_scale", "microscope_shear",
                         "microscope_stretch"), "approach": ("backlash_x_m", "backlash_y_m"),
@@ -62,8 +64,10 @@ PLANS = {
 
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
-    """What else noise may be has its own tests (test_axes.py, test_correlated.py)."""
+    """What else noise may be, and doubt, have their own tests (test_axes.py, test_sizes.py)."""
     monkeypatch.setattr(solve, "MAX_SITES", 0)
+    monkeypatch.setattr(sizes, "DOUBT_LEVEL", sizes.SIZE_LEVEL)
+    monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
 
 @cache

@@ -91,7 +91,8 @@ def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(spread, by_
     """No size grows for a turn of lines, and no turn of lines is named where a size is wrong."""
     truth, readings = truth_and_readings(5, FINE_RAD, spread=spread, sense=sense)
     result = calibrate(turned(readings, 3, by_rad), Options())
-    assert result.verdict.grade is Grade.ENLARGED
+    told = name != "plate_strain"  # Hu's views do not determine two of its modes
+    assert result.verdict.grade is (Grade.ENLARGED if told else Grade.NOT_QUALIFIED)
     assert [cause.name for cause in result.verdict.causes] == [name]
     assert [term.name for term in result.model.terms if term.size_used] == [name]
     assert covered(result, truth.g) >= 0.85

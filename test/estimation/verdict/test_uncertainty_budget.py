@@ -62,11 +62,15 @@ def test_reading_noise_is_that_of_the_map():
 
 
 def test_noise_beyond_the_repeats_is_in_the_noise_once():
-    """Where the verdict's test fails, the map's u is that of the residuals already."""
+    """Where the test fails the noise is that of the residuals, which are more than noise."""
     result = calibrated(extra_m=3e-8)
-    part = parts_of(budgets(result)[0])["reading noise"]
+    parts = parts_of(budgets(result)[0])
+    part, lack = parts["reading noise"], parts["effect lack_of_fit"]
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    assert part.effect_rms == pytest.approx(np.sqrt((u**2).mean()))
+    assert np.hypot(part.effect_rms, lack.effect_rms) == pytest.approx(np.sqrt((u**2).mean()))
+    # in full at every node, by the view that has most, with its upper limit
+    assert 3e-8 < lack.effect_rms < 4.5e-8 and lack.effect_max == pytest.approx(lack.effect_rms)
+    assert line_text(lack) == "residuals beyond the scatter of repeats, met in full at every place"
     assert part.dof == result.noise.dof_xy_residuals
     assert part.details == by("residuals", contradicted=True)
     assert line_text(part) == ("residuals of the fit, the larger of two that contradict each "
