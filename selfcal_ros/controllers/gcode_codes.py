@@ -6,33 +6,7 @@ From the sources of LinuxCNC 2.9, grbl 1.1, Marlin 2.1 and Klipper 0.13. All els
 
 from typing import NamedTuple
 
-LINUXCNC = """
-rapid: G0 XYZ
-line: G1 XYZ
-arc: G2 G3 XYZIJR
-hole: G81 G85 XYZR
-hole: G82 G86 G89 XYZRP
-hole: G73 G83 XYZRQ
-cancel: G80
-dwell: G4 P
-home: G28 G30 XYZ
-machine: G53
-probe: G38.2 G38.3 G38.4 G38.5 Z
-tool length: G43.1 Z
-distance: G90 G91
-unit: G20 G21
-plane: G17 G18 G19
-path: G61 G61.1
-path: G64 PQ
-frame: G54 G55 G56 G57 G58 G59 G59.1 G59.2 G59.3
-offset: G49
-offset: G43 H
-unknown: M6
-other: G40 G91.1 G94 G95 G97 G98 G99 M3 M4 M5 M7 M8 M9 M48 M49
-stop: M0 M1 M60
-end: M2 M30
-"""
-GRBL = """
+RS274 = """
 rapid: G0 XYZ
 line: G1 XYZ
 arc: G2 G3 XYZIJR
@@ -42,14 +16,30 @@ home: G28 G30 XYZ
 machine: G53
 probe: G38.2 G38.3 G38.4 G38.5 Z
 tool length: G43.1 Z
-tool length: G49
 distance: G90 G91
 unit: G20 G21
 plane: G17 G18 G19
 frame: G54 G55 G56 G57 G58 G59
-other: G40 G61 G91.1 G94 M3 M4 M5 M7 M8 M9
+other: G40 G91.1 G94 M3 M4 M5 M7 M8 M9
 stop: M0 M1
 end: M2 M30
+"""
+LINUXCNC = RS274 + """\
+hole: G81 G85 XYZR
+hole: G82 G86 G89 XYZRP
+hole: G73 G83 XYZRQ
+path: G61 G61.1
+path: G64 PQ
+frame: G59.1 G59.2 G59.3
+offset: G49
+offset: G43 H
+unknown: M6
+other: G95 G97 G98 G99 M48 M49
+stop: M60
+"""
+GRBL = RS274 + """\
+tool length: G49
+other: G61
 """
 MARLIN = """
 line: G0 G1 XYZEF

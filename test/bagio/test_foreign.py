@@ -182,8 +182,7 @@ def test_files_that_were_renamed_are_read(tmp_path, events, expected):
 
 def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, expected):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
-    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(
-        {"rosbag2_bagfile_information": {"relative_file_paths": ["a.mcap", "b.mcap"]}}))
+    listing(tmp_path / "bag", "a.mcap", "b.mcap")
     result, lost = solved(tmp_path / "bag")
     assert result == expected
     assert lost == ["the file b.mcap, which metadata.yaml lists, is missing"]

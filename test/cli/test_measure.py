@@ -13,17 +13,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from test.support.cells import CELL, write_cell
+from test.support.cells import CELL, PLAN, write_cell
 
-LINES = """
-plan_id: with_lines
-artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 4}
-check_stops: {marks: 3, offset: 20e-6}
-views:
-  - {name: identity, repeats: 2}
-  - {name: rot90, rotation_deg: 90, repeats: 2}
-  - {name: shift, translation_pitch: [1, 0], repeats: 2}
-"""
+LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 
 
 def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, capsys):
