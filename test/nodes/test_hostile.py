@@ -150,10 +150,12 @@ def play(graph, events) -> None:
 
 
 def send(graph, topic, messages) -> None:
-    """Publish messages, or the bytes of some, and wait until they have arrived."""
+    """Publish messages, or the bytes of some, to all that hear them, and wait for their arrival."""
     heard: list = []
     ear = graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos, raw=True)
-    voice, sent = graph.publisher(topic, readers=2), 0
+    name = graph.hand.resolve_topic_name(topic.name)
+    readers = sum(name in subscribed(node) for node in graph.nodes if node is not graph.hand)
+    voice, sent = graph.publisher(topic, readers=1 + readers), 0
     for group in batched(messages, min(AT_ONCE, topic.qos.depth)):
         for one in group:
             voice.publish(one)
