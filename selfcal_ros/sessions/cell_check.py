@@ -399,7 +399,9 @@ class CellCheck:
         self._tell("theta", not reversed_,
                    f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
                    f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad" + (
-                       ": offset_theta has the other sign" if reversed_ else ""),
+                       ": offset_theta has the other sign" if reversed_ else
+                       "" if abs(by_marks) > LEAST_TURN_RAD else
+                       ", too little to tell the sign: turn the plate by 1 mrad and check again"),
                    "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise")
 
     def _judge_wiring(self, measurements: Measurements, stops: int) -> tuple[bool, bool]:

@@ -7,7 +7,7 @@ Each possible fault is undone in the recorded messages, which are collected agai
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import pi
+from math import radians
 
 import numpy as np
 
@@ -46,7 +46,7 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
     command : Command
         MEASURE of the view.
     events : sequence of EncoderSample or Detection
-        All messages since then.
+        All messages of the view.
     settings : CollectorSettings
         Names of the joints, sense, limits.
     """
@@ -156,7 +156,7 @@ def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
     remedy = "place the plate as commanded, and measure the view of the command"
     for deg in (90, 180, 270):
         yield Fault(f"the marks are those of a plate turned by {deg}°", remedy, replace(
-            command, view=replace(view, rotation_rad=deg * pi / 180)), tuple(events))
+            command, view=replace(view, rotation_rad=radians(deg))), tuple(events))
     for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         yield Fault(f"the marks are those of a plate shifted by {a or b:+d} pitch along "
                     f"{'x' if a else 'y'}", remedy, replace(command, view=replace(

@@ -24,6 +24,7 @@ def test_lines_show_the_turn_of_the_plate_or_its_opposite(turn, lines, passed):
     [item] = check.items
     assert (item.name, item.passed) == ("theta", passed)
     assert ("other sign" in item.figure) is not passed
+    assert ("too little to tell the sign" in item.figure) is (abs(turn) < 2e-4)
 
 
 @pytest.mark.parametrize("deg", [0.0, 30.0, 90.0, -135.0])
