@@ -94,7 +94,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     solved = judged(solved, measurements, options)
     result = solved.result
     if options.method == "joint" and not _agree(result):
-        _check_turned(measurements, options)
+        _check_turned(measurements, options, result)
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
     shown = {} if camera is None else camera.to_dict()
@@ -142,7 +142,8 @@ def _agree(result: CalibrationResult) -> bool:
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
-def _check_turned(measurements: Measurements, options: Options) -> None:
+def _check_turned(measurements: Measurements, options: Options,
+                  as_given: CalibrationResult) -> None:
     """Raise WiringError if the readings agree with another wiring of the offsets."""
     if not shows_offsets(measurements):
         return
@@ -153,8 +154,11 @@ def _check_turned(measurements: Measurements, options: Options) -> None:
             solved = solve_joint(turned, options)
         except NotSettledError:
             return False
-        return _agree(judged(solved, turned, options).result)
+        result = judged(solved, turned, options).result
+        return _agree(result) or (contradicted and not result.verdict.failed)
 
+    # an effect beyond U leaves a result unqualified, and contradicts no wiring
+    contradicted = options.finite_rotations and bool(as_given.verdict.failed)
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks
     fitting = [] if shown else [pair for pair in PAIRS if any(agree(one, plain) for one in pair)]
