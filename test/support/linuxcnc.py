@@ -28,6 +28,8 @@ MAX_ACCELERATION = 20000
 FERROR = 5
 MIN_FERROR = 1
 HOME_SEQUENCE = 0
+COMP_FILE = comp_{axis}.txt
+COMP_FILE_TYPE = 0
 """
 INI = """
 [EMC]
@@ -55,7 +57,7 @@ CYCLE_TIME = 0.1
 [KINS]
 KINEMATICS = trivkins coordinates=XY
 JOINTS = 2
-""" + JOINT.format(letter="X", number=0) + JOINT.format(letter="Y", number=1)
+""" + JOINT.format(letter="X", axis="x", number=0) + JOINT.format(letter="Y", axis="y", number=1)
 HAL = """
 loadrt [KINS]KINEMATICS
 loadrt [EMCMOT]EMCMOT servo_period_nsec=[EMCMOT]SERVO_PERIOD num_joints=[KINS]JOINTS
@@ -68,6 +70,11 @@ net estop iocontrol.0.user-enable-out => iocontrol.0.emc-enable-in
 DISPLAY = """#!/bin/sh
 exec linuxcncrsh --port {port} -- "$@"
 """
+MOTORS = """
+import hal
+reader = hal.component("reader")
+print(*(repr(hal.get_value(f"joint.{number}.motor-pos-cmd")) for number in (0, 1)))
+"""
 SWITCHED_ON = ("verbose on", "enable EMCTOO", "estop off", "machine on", "mode manual",
                "home 0", "home 1")
 
@@ -76,7 +83,8 @@ SWITCHED_ON = ("verbose on", "enable EMCTOO", "estop off", "machine on", "mode m
 def running(folder: Path) -> Iterator[str]:
     """Run LinuxCNC in a folder, switched on and homed; yield its address for pyserial.
 
-    Only one can run on a machine. Limits of X and Y are -20 and 20 mm.
+    The folder has its tables, comp_x.txt and comp_y.txt. Only one can run on a machine. Limits of
+    X and Y are -20 and 20 mm.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -102,13 +110,24 @@ def running(folder: Path) -> Iterator[str]:
                 process.wait(20)
 
 
+def motors() -> tuple[float, float]:
+    """Return where its motors are commanded to be, mm: where its axes are, and the correction."""
+    done = subprocess.run([*_ordinary_user(), "/usr/bin/python3", "-I", "-c", MOTORS], check=True,
+                          capture_output=True, text=True)
+    x, y = done.stdout.split()
+    return float(x), float(y)
+
+
 def _as_ordinary_user(folder: Path) -> list[str]:
-    """Return the words before a command that give up the rights of root, with which it stops."""
-    if os.getuid() != 0:
-        return []
-    for path in (folder, *folder.iterdir()):
+    """Give a folder to that user; return the words of `_ordinary_user`."""
+    for path in (folder, *folder.iterdir()) if _ordinary_user() else ():
         shutil.chown(path, "nobody")
-    return ["setpriv", "--reuid", "nobody", "--clear-groups"]
+    return _ordinary_user()
+
+
+def _ordinary_user() -> list[str]:
+    """Return the words before a command that give up the rights of root, with which it stops."""
+    return ["setpriv", "--reuid", "nobody", "--clear-groups"] if os.getuid() == 0 else []
 
 
 def _listens(number: int) -> bool:
