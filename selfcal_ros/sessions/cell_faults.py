@@ -162,4 +162,3 @@ def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
                     f"{'x' if a else 'y'}", remedy, replace(command, view=replace(
                         view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m))),
                     tuple(events))
-
