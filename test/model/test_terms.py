@@ -53,9 +53,9 @@ def test_a_size_of_0_says_that_there_is_no_such_term():
     assert [(term.name, term.size, term.free) for term in terms] == [
         ("drift", 1e-9, False), ("plate_strain", 0.0, False)]
     names = [term.name for term in Options(terms=terms).model_terms(visits=True)]
-    assert names == ["drift", "microscope", "line_eccentricity", "rotation", "yaw"]
+    assert names == ["drift", "microscope", "plate_shape", "line_eccentricity", "rotation", "yaw"]
     assert [term.name for term in Options(terms=terms).model_terms(visits=False)] == [
-        "drift", "line_eccentricity", "rotation", "yaw"]
+        "drift", "plate_shape", "line_eccentricity", "rotation", "yaw"]
     assert Options(terms=terms, assumed=()).model_terms(visits=True) == terms[:1]
 
 

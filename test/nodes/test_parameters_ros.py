@@ -99,12 +99,12 @@ def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
                                                               namespace):
     """As ROS reads them: a bare y is true, and `name:` does not hold in a namespace."""
     stated = overrides_in(yaml.safe_load(file.read_text()), name, str(file))
-    more = [word for key, value in needed.get(name, {}).items() if key not in stated
-            for word in ("-p", f"{key}:={value}")]
+    given = {key: value for key, value in needed.get(name, {}).items() if not stated.get(key)}
+    more = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
     node = graph.add(NODES[name](context=graph.context, namespace=namespace, cli_args=[
         "--ros-args", "--params-file", str(file), *more]))
-    for key, value in stated.items():
-        assert node.get_parameter(key).value == value
+    for key in stated.keys() - given.keys():
+        assert node.get_parameter(key).value == stated[key]
     if name in ("bag_recorder", "cell_driver"):
         node.close()
 
