@@ -155,7 +155,9 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    names = {term.name for term in named} | ({
+    declared = (*parse_terms(plan.model_terms, "model_terms"),
+                *parse_terms(_named(given), "--model"))  # a size of 0 among them
+    names = {term.name for term in (*named, *declared)} | ({
         block.name for block in blocks().values() if block.of_offsets and tells_camera(plan)})
     return () if _is_none(given) else tuple(
         term for term in default_terms() if term.name not in names)

@@ -420,3 +420,13 @@ def test_images_tell_the_camera_and_suffice_with_two_turns(tmp_path, capsys):
     better = plan_from_dict(read_yaml(tmp_path / "q.yaml"), "q")
     assert better.views[1].image == better.views[0].image
     assert better.views[1].image.nx == 3
+
+
+def test_a_size_of_0_takes_a_default_term_out_of_the_predicted_u(capsys):
+    components = {}
+    for size in ("5e-9", "0"):
+        words = ["plan", "check", shipped("hu"), "--json", "--model", f"plate_shape:{size}"]
+        assert main(words) == 0
+        lines = json.loads(capsys.readouterr().out)["budget"]["lines"]
+        components[size] = {line["component"] for line in lines if line["quantity"] == "xy"}
+    assert components["5e-9"] - components["0"] == {"plate_shape"}
