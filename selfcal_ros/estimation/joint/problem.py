@@ -78,6 +78,19 @@ class NoiseEstimate:
         return self.declared if np.isfinite(self.declared) else self.repeats
 
     @property
+    def known(self) -> float:
+        """Largest noise that is known without the residuals, declared or of repeats; 0 if none."""
+        return float(np.nanmax([self.declared, self.repeats, 0.0]))
+
+    @property
+    def p_of_known(self) -> float:
+        """Two-sided probability that the residuals have the noise that is `known`."""
+        if not self.repeats > self.stated:
+            return self.p
+        return _same_noise((self.repeats, self.dof_repeats),
+                           (self.residuals, self.dof_residuals), FLOOR)
+
+    @property
     def contradicted(self) -> bool:
         """Whether residuals and repeats (or declaration) contradict each other."""
         if not self.p < F_LEVEL:

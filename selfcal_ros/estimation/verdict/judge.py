@@ -173,8 +173,7 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     weight, residuals : float arrays (views, ...)
         Weights and residuals of the readings.
     """
-    known = np.nanmax([noise.stated, noise.repeats, 0.0])
-    if not (noise.p < LACK_LEVEL and noise.residuals > known):
+    if not (noise.p_of_known < LACK_LEVEL and noise.residuals > noise.known):
         return 0.0
     each = weight.reshape(len(weight), -1)
     squares = (each * residuals.reshape(each.shape) ** 2).sum(axis=1)
@@ -182,7 +181,7 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     dof = noise.dof_residuals * share
     largest = noise.residuals**2 * squares / squares.sum() * noise.dof_residuals / chdtri(
         dof, 1 - DOUBT_LEVEL)
-    return float(np.sqrt(max(largest.max() - known**2, 0.0) / each[each > 0].mean()))
+    return float(np.sqrt(max(largest.max() - noise.known**2, 0.0) / each[each > 0].mean()))
 
 
 def _excluded(solved: Solved, result: CalibrationResult,
@@ -199,7 +198,7 @@ def _excluded(solved: Solved, result: CalibrationResult,
 def _unexplained_noise(solved: Solved) -> bool:
     """Return whether the noise is not known, or residuals are larger than U covers."""
     return not np.isfinite(solved.xy.sigma) or any(
-        noise.contradicted and noise.residuals > UNEXPLAINED * noise.stated
+        noise.contradicted and noise.residuals > UNEXPLAINED * noise.known
         for noise in (solved.xy, solved.theta))
 
 

@@ -15,6 +15,7 @@ from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.reporting.words.tables import budget_text, quantity_text
@@ -80,6 +81,22 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     more = np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8
     assert part.effect_rms == pytest.approx(quiet.effect_rms * more, rel=0.15)
     assert quiet.details == by("repeats")
+
+
+def test_noise_that_repeats_show_beyond_the_declared_is_not_lack_of_fit():
+    """A detector knows the noise of its image, not the vibration of the stage."""
+    rng = np.random.default_rng(1)
+    truth = random_truth(ARTIFACT, 4, rng)
+    readings = simulate_measurements(truth, hu_plan(ARTIFACT, 5), rng, sigma_m=2e-8,
+                                     sigma_theta_rad=2e-5)
+    views = tuple(replace(view, u=np.full(view.dx.shape, 1e-8 / np.sqrt(5)))
+                  for view in readings.views)
+    result = calibrate(replace(readings, views=views), BARE)
+    assert result.verdict.grade == Grade.ENLARGED  # the declaration is contradicted
+    parts = parts_of(budgets(result)[0])
+    assert "effect lack_of_fit" not in parts
+    assert parts["reading noise"].effect_rms == pytest.approx(
+        parts_of(budgets(calibrated())[0])["reading noise"].effect_rms, rel=0.1)
 
 
 def test_without_repeats_the_residuals_speak():
