@@ -28,7 +28,7 @@ build/linters/.clean: build/linters/.complete setup.cfg $(shell find $(LINTED) -
 ament-lint: build/linters/.clean  ## what ament_flake8 and ament_pep257 check
 # bytecode is kept: else each worker compiles all tests anew, and each process that they start the package
 # three workers on two cores: as a rule one waits for a message
-build/oracles/.complete: tools/oracle-requirements.txt tools/printer-requirements.txt | setup
+build/oracles/.complete: tools/oracle-requirements.txt tools/printer-requirements.txt tools/plate-requirements.txt | setup
 	@mkdir -p build/oracles; for pins in $^; do $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--no-deps --require-hashes --upgrade --target build/oracles -r $$pins \
 		|| echo "test: what $$pins names is left out: it cannot be installed"; done; touch $@
