@@ -174,13 +174,13 @@ def run(args: argparse.Namespace) -> int:
     cell_path = Path(args.cell) if args.cell else path.with_name("cell.yaml")
     simulation = cell_path.with_name(f"{cell_path.stem}_simulation.yaml")
     if sys.stdin.isatty():  # before anything is asked
-        _require_new([path, cell_path])
+        _require_new([path, cell_path], force=args.force)
     known = _answers(args)
     artifact = _artifact(known)
     _require_travel(known, artifact)
     simulated = known.machine == "simulated"
     outputs = [path, cell_path, *([simulation] if simulated else [])]
-    _require_new(outputs)
+    _require_new(outputs, force=args.force)
     with late_progress("judging plans") as progress:
         plan = _best(known, artifact, path.stem, lambda: progress(0, None))
         found = _budget(plan), _next(plan)
@@ -194,12 +194,13 @@ def run(args: argparse.Namespace) -> int:
     return int(ExitCode.DONE)
 
 
-def _require_new(paths: list[Path]) -> None:
-    """Refuse files that cannot be written, or exist."""
+def _require_new(paths: list[Path], *, force: bool) -> None:
+    """Refuse files that cannot be written, or exist and are not to be replaced."""
     check_outputs([], paths)
     for path in paths:
-        if path.exists():
-            raise InputError(str(path), "exists already", "remove it or name another file")
+        if path.exists() and not force:
+            raise InputError(str(path), "exists already",
+                             "name another file, or replace it with --force")
 
 
 def _answers(args: argparse.Namespace) -> Known:

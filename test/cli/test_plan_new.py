@@ -98,6 +98,8 @@ def test_nothing_is_overwritten(capsys):
     assert new(*STAGE) == 2
     assert "cell.yaml: exists already" in capsys.readouterr().err
     assert Path("cell.yaml").read_text() == "mine"
+    assert new(*STAGE, "--force") == 0
+    assert Path("cell.yaml").read_text().startswith("# From `selfcal plan new`.")
 
 
 def test_a_person_is_asked_in_a_terminal(tmp_path):
