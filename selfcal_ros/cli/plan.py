@@ -94,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace, plan: Plan) -> int:
     assumed, sizes = plan_terms.assumed_of(args), plan_terms.sizes_of(args)
-    model = plan_terms.model_of(args, plan)
+    declared = plan_terms.declared_of(args, plan)
+    model = tuple(term for term in declared if term.size > 0)
     plan = _repeated(plan, args.repeats)
     alone: Prediction | None = None
     joint: Prediction | None = None
@@ -107,7 +108,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
         if alone is not None and seen.identifiable:
-            terms = (*model, *plan_terms.assumed_terms(args.model, model, plan))
+            terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
             budget = plan_budget(plan, terms, assumed, alone, asked=[term.name for term in model])
     if args.json:
         found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)

@@ -124,13 +124,13 @@ def sizes_of(args: argparse.Namespace) -> dict[str, float]:
     return {term.name: term.size for term in terms}
 
 
-def model_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
-    """Return the terms of the model: the plan's, replaced by those of ``--model``."""
+def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
+    """Return the terms of the plan, replaced by those of ``--model``; those of size 0 as well."""
     if _is_none(args.model):
         return ()
     found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
                                            parse_terms(args.model, "--model")) for term in terms}
-    return tuple(term for term in in_order(found.values()) if term.size > 0)
+    return in_order(found.values())
 
 
 def _is_none(given: list[str]) -> bool:
@@ -151,13 +151,11 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
     given : list of str
         What ``--model`` or ``--against`` says: ``none`` excludes them.
     named : tuple of ModelTerm
-        Terms of the plan and of the option.
+        Terms of the plan and of the option, those of size 0 as well.
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    declared = (*parse_terms(plan.model_terms, "model_terms"),
-                *parse_terms(_named(given), "--model"))  # a size of 0 among them
-    names = {term.name for term in (*named, *declared)} | ({
+    names = {term.name for term in named} | ({
         block.name for block in blocks().values() if block.of_offsets and tells_camera(plan)})
     return () if _is_none(given) else tuple(
         term for term in default_terms() if term.name not in names)
