@@ -78,14 +78,19 @@ class NoiseEstimate:
         return self.declared if np.isfinite(self.declared) else self.repeats
 
     @property
+    def exceeded(self) -> bool:
+        """Whether many repeats show more noise than is declared, as of a stage that vibrates."""
+        return self.dof_repeats >= MIN_REPEAT_DOF and self.repeats > self.stated
+
+    @property
     def known(self) -> float:
-        """Largest noise that is known without the residuals, declared or of repeats; 0 if none."""
-        return float(np.nanmax([self.declared, self.repeats, 0.0]))
+        """Noise that is known without the residuals: `stated`, or that of repeats; 0 if none."""
+        return float(np.nan_to_num(self.repeats if self.exceeded else self.stated))
 
     @property
     def p_of_known(self) -> float:
         """Two-sided probability that the residuals have the noise that is `known`."""
-        if not self.repeats > self.stated:
+        if not self.exceeded:
             return self.p
         return _same_noise((self.repeats, self.dof_repeats),
                            (self.residuals, self.dof_residuals), FLOOR)

@@ -65,6 +65,15 @@ def test_declared_noise_is_held_against_the_residuals():
     assert noise_estimate((NAN, 0), (NAN, 0), 1e-8).k == pytest.approx(2.37, abs=0.01)
 
 
+@pytest.mark.parametrize(("dof", "known"), [(100, 3e-8), (4, 2e-8)])
+def test_many_repeats_excuse_residuals_beyond_the_declared_noise_few_do_not(dof, known):
+    found = noise_estimate((3e-8, dof), (3.1e-8, 60), 2e-8)
+    assert found.contradicted and found.known == known
+    residuals = (3.1e-8 / known) ** 2
+    wanted = f_distribution.sf(residuals, 60, dof if known > 2e-8 else 1e9)
+    assert found.p_of_known == pytest.approx(2 * wanted, rel=1e-3)
+
+
 def test_nothing_to_compare_is_no_contradiction():
     for repeats, residuals in (((NAN, 0), (1e-8, 9)), ((1e-8, 40), (NAN, 0)),
                                ((0.0, 40), (1e-8, 9)), ((0.0, 40), (0.0, 9))):
