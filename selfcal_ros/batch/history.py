@@ -4,7 +4,7 @@
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -48,6 +48,12 @@ class Entry:
         extra = self.result.extra
         return "recheck" if "recheck" in extra else "mean" if "combined" in extra else "calibration"
 
+    @property
+    def expanded_m(self) -> float:
+        """U of the map at its nodes, root mean square, m."""
+        emap = self.result.error_map
+        return COVERAGE * float(np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))))
+
 
 @dataclass(frozen=True)
 class Drift:
@@ -72,6 +78,11 @@ class Drift:
     def is_clear(self) -> bool:
         """Whether a drift is observed at all."""
         return self.per_day_m > COVERAGE * self.u_per_day_m
+
+    @property
+    def most_per_day_m(self) -> float:
+        """The drift of a day if it is clear, else the largest that may have been missed, m."""
+        return self.per_day_m if self.is_clear else COVERAGE * self.u_per_day_m
 
 
 def history(folder: Path) -> list[Entry]:
@@ -150,12 +161,11 @@ def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
     t = np.array(days)
     per_day = float(t @ changes / (t @ t))
     u_per_day = float(np.hypot.reduce(t * u) / (t @ t))
-    emap = active.result.error_map
-    limit = COVERAGE * float(np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))))
-    drift = Drift(per_day, u_per_day, limit, None)
-    rate = per_day if drift.is_clear else COVERAGE * u_per_day
+    drift = Drift(per_day, u_per_day, active.expanded_m, None)
+    if not drift.most_per_day_m:
+        return drift
     try:
-        due = active.measured + timedelta(days=limit / rate) if rate else None
+        due = active.measured + timedelta(days=drift.limit_m / drift.most_per_day_m)
     except OverflowError:  # thousands of years
-        due = None
-    return Drift(per_day, u_per_day, limit, due)
+        return drift
+    return replace(drift, due=due)

@@ -70,7 +70,7 @@ def _text(folder: Path, entries: list[Entry], active: tuple[Entry | None, str],
         mark = "*" if entry is used else " "
         grade = "" if entry.result.verdict.qualified else ", not qualified"
         yield (f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<13}"
-               f"{_largest_m(entry) * UM_PER_M:>12.4g} µm{_expanded_m(entry) * NM_PER_M:>9.3g} nm  "
+               f"{_largest_m(entry) * UM_PER_M:>12.4g} µm{entry.expanded_m * NM_PER_M:>9.3g} nm  "
                f"{_change_text(entry.change)}  {entry.path.relative_to(folder)}{grade}")
     if used is None:
         yield f"no map is active: selfcal history {folder} --activate RESULT.json"
@@ -94,7 +94,7 @@ def _drift_text(drift: Drift | None) -> str:
         return "drift: nothing to compare with the active map; recheck the stage to learn it"
     day = (f"{drift.per_day_m * NM_PER_M:.3g} ± {drift.u_per_day_m * NM_PER_M:.2g} nm a day (k=1)"
            if drift.is_clear else "none beyond its uncertainty, so below "
-           f"{2 * drift.u_per_day_m * NM_PER_M:.2g} nm a day")
+           f"{drift.most_per_day_m * NM_PER_M:.2g} nm a day")
     if drift.due is None:
         return f"drift from the active map: {day}; it will not reach U"
     return (f"drift from the active map: {day}; it reaches U, {drift.limit_m * NM_PER_M:.3g} nm, "
@@ -107,11 +107,6 @@ def _largest_m(entry: Entry) -> float:
     return float(np.nanmax(np.abs([emap.gx, emap.gy])))
 
 
-def _expanded_m(entry: Entry) -> float:
-    emap = entry.result.error_map
-    return 2 * float(np.sqrt(np.nanmean(np.square([emap.u_gx, emap.u_gy]))))
-
-
 def _entry_json(entry: Entry) -> dict[str, Any]:
     change = entry.change
     found: dict[str, Any] = {"not_compared": change or None} if isinstance(change, str) else {
@@ -121,4 +116,4 @@ def _entry_json(entry: Entry) -> dict[str, Any]:
     return {"file": str(entry.path), "kind": entry.kind,
             "measured": entry.measured.isoformat(timespec="seconds"),
             "grade": str(entry.result.verdict.grade), "largest_m": _largest_m(entry),
-            "U_rms_m": _expanded_m(entry), **found}
+            "U_rms_m": entry.expanded_m, **found}

@@ -147,6 +147,8 @@ def _check_turned(measurements: Measurements, options: Options,
     """Raise WiringError if the readings agree with another wiring of the offsets."""
     if not shows_offsets(measurements):
         return
+    # an effect beyond U leaves a result unqualified, and contradicts no wiring
+    contradicted = options.finite_rotations and bool(as_given.verdict.failed)
 
     def agree(wiring: Turned, options: Options) -> bool:
         turned = turned_readings(measurements, wiring)
@@ -157,8 +159,6 @@ def _check_turned(measurements: Measurements, options: Options,
         result = judged(solved, turned, options).result
         return _agree(result) or (contradicted and not result.verdict.failed)
 
-    # an effect beyond U leaves a result unqualified, and contradicts no wiring
-    contradicted = options.finite_rotations and bool(as_given.verdict.failed)
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks
     fitting = [] if shown else [pair for pair in PAIRS if any(agree(one, plain) for one in pair)]
