@@ -9,51 +9,20 @@ from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.gcode import GcodeMachine
 from selfcal_ros.machine.measuring import Run
 from test.machine.test_measuring import away_from
-from test.support.cells import CELL, Agreeing, write_cell
+from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
 from test.support.firmware import Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
 
 pytest.importorskip("serial")
 KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
 
-QUIET = """
-plan: plan.yaml
-seed: 3
-truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
-cell: {servo_sigma: 0.0}
-"""
-PLAN = """
-plan_id: p
-artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}
-check_stops: {marks: 2, offset: 25e-6}
-views:
-  - {name: a, repeats: 2}
-  - {name: b, rotation_deg: 90}
-  - {name: c, translation_pitch: [1, 0]}
-"""
-
-
-class WithPlate(GcodeMachine):
-    """A plate lies under the camera of the controller's machine."""
-
-    def __init__(self, firmware, simulated, **keys) -> None:
-        self._firmware, self._simulated = firmware, simulated
-        super().__init__(feed=6000.0, **keys)
-
-    def place(self, placing) -> None:
-        self._simulated.place(placing)
-
-    def image(self):
-        self._simulated.move_to((self.position()[0], self.position()[1], 0.0))
-        return self._simulated.image()
-
 
 @pytest.mark.parametrize("dialect", KINDS)
 @pytest.mark.parametrize("over", [over_tcp, over_pty])
 def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=PLAN, cell=CELL)
+    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
     firmware = KINDS[dialect]()
     with over(firmware) as port:
-        machine = WithPlate(firmware, simulated, port=port, dialect=dialect)
+        machine = WithPlate(simulated, port=port, dialect=dialect)
         try:
             Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
                 Agreeing()).measure()

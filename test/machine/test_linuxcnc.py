@@ -16,10 +16,9 @@ from selfcal_ros.controllers.grid import Wiring
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.model.artifact import Artifact
-from test.machine.test_gcode import PLAN, QUIET, WithPlate
 from test.machine.test_measuring import away_from
 from test.support import linuxcnc
-from test.support.cells import CELL, Agreeing, write_cell
+from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
 from test.support.maps import random_map, result_of
 from test.support.waiting import wait_until
 
@@ -32,7 +31,7 @@ def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
 
     Its motors go to the true position and the error of the map there, but for that at its zero.
     """
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=PLAN, cell=CELL)
+    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
     emap = random_map(Artifact(5, 0.005, 0, 5), 1)
     emap = replace(emap, gx=emap.gx[:, :1] + 0 * emap.gx, gy=emap.gy[:1] + 0 * emap.gy)
     with tempfile.TemporaryDirectory() as folder:
@@ -40,7 +39,7 @@ def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
                                  "comp.txt").files.items():
             Path(folder, name).write_text(text)
         with linuxcnc.running(Path(folder)) as port:
-            machine = WithPlate(None, simulated, port=port, dialect="linuxcnc")
+            machine = WithPlate(simulated, port=port, dialect="linuxcnc")
             try:
                 Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
                     Agreeing()).measure()

@@ -12,7 +12,7 @@ from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.ophyd import OphydMachine
 from test.machine.test_measuring import away_from
-from test.support.cells import Agreeing, Jumping, write_cell
+from test.support.cells import QUIET, Agreeing, Jumping, write_cell
 
 pytest.importorskip("ophyd", exc_type=ImportError)
 pytestmark = pytest.mark.filterwarnings("ignore")  # of its own and its libraries' imports
@@ -33,9 +33,7 @@ def test_a_plan_is_measured_to_its_true_map(tmp_path, devices):
     from ophyd import Component, Device
     from ophyd.sim import SynSignal
 
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=(
-        "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
-        "cell: {servo_sigma: 0.0}\n"))
+    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET)
 
     def picture():
         simulated.move_to((devices.x.position / 1e3, devices.y.position / 1e3, 0.0))

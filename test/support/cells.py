@@ -5,6 +5,7 @@ import numpy as np
 
 from selfcal_ros.machine import Image, MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell
+from selfcal_ros.machine.gcode import GcodeMachine
 
 START_NS = 1_700_000_000_000_000_000
 PLAN = """
@@ -21,6 +22,21 @@ plan: plan.yaml
 seed: 3
 truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
 noise: {sigma_xy: 5.0e-9, sigma_theta: 1.0e-6}
+"""
+QUIET = """
+plan: plan.yaml
+seed: 3
+truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
+cell: {servo_sigma: 0.0}
+"""
+FEW = """
+plan_id: p
+artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}
+check_stops: {marks: 2, offset: 25e-6}
+views:
+  - {name: a, repeats: 2}
+  - {name: b, rotation_deg: 90}
+  - {name: c, translation_pitch: [1, 0]}
 """
 CAMERA = "camera: {width: 150, height: 140, pixel_size: 2.0e-6, mark_size: 50.0e-6, turn: 3.0}\n"
 DETECTOR = "detector: {pixel_size: 2.0e-6, mark_size: 50.0e-6, turn: 3.0}\n"
@@ -67,6 +83,21 @@ class Agreeing:
 
     def say(self, line: str) -> None:
         self.lines.append(line)
+
+
+class WithPlate(GcodeMachine):
+    """A plate lies under the camera of the controller's machine."""
+
+    def __init__(self, simulated, **keys) -> None:
+        self._simulated = simulated
+        super().__init__(feed=6000.0, **keys)
+
+    def place(self, placing) -> None:
+        self._simulated.place(placing)
+
+    def image(self):
+        self._simulated.move_to((self.position()[0], self.position()[1], 0.0))
+        return self._simulated.image()
 
 
 class Spoilt:
