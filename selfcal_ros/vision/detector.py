@@ -196,7 +196,7 @@ class MarkDetector:
         fault = self._fault(fit)
         if fault is not None:
             return fault
-        u_u, u_v = np.sqrt(np.diagonal(fit.covariance)).tolist()
+        u_u, u_v = fit.sigmas
         return Mark(column + float(fit.centre[0]), row + float(fit.centre[1]), u_u, u_v,
                     min(max(fit.explained, 0.0), 1.0), fit)
 
@@ -214,7 +214,7 @@ class MarkDetector:
             return Fault.BROKEN if fit.inner_stains > fit.outer_stains else Fault.DIRT
         if abs(size / self.size - 1) > given.size_tolerance:
             return Fault.WRONG_SIZE
-        if not np.sqrt(np.diagonal(fit.covariance)).max() <= given.max_sigma_px:
+        if not max(fit.sigmas) <= given.max_sigma_px:
             return Fault.WEAK
         return None
 

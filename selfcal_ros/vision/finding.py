@@ -32,12 +32,11 @@ TEMPLATE_BLUR = 0.08
 
 @dataclass(frozen=True)
 class Candidate:
-    """Place of a possible mark in the image, px, its angle, rad, and correlation."""
+    """Place of a possible mark in the image, px, and its angle, rad."""
 
     column: int
     row: int
     angle: float
-    correlation: float
 
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:
@@ -134,23 +133,20 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
     peaks = (best > amplitude) & (best == _largest(best, round(APART * size / factor)))
     if np.count_nonzero(peaks) > PEAKS * most:
         raise too_many(most)
-    found_at: list[Candidate] = []
-    for row, column in zip(*np.nonzero(peaks), strict=True):
-        square = padded[row:row + 2 * half + 1, column:column + 2 * half + 1].astype(float)
-        norm = square.size ** 0.5 * max(float(square.std()), 1e-3)
-        correlation = float(best[row, column]) / norm
-        if correlation <= CORRELATION:
-            continue
-        if len(found_at) == most:
-            raise too_many(most)
-        near = [float(np.vdot(template.square, square)) for template in templates]
-        which = int(np.argmax(np.abs(near) if sign == 0 else near))
-        finer = (float(column) + _vertex(best[row, :], column),
-                 float(row) + _vertex(best[:, column], row))
-        found_at.append(Candidate(
-            round((finer[0] + 0.5) * factor - 0.5), round((finer[1] + 0.5) * factor - 0.5),
-            templates[which].angle, correlation))
-    return found_at
+    rows, columns = np.nonzero(peaks)
+    squares = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1, 2 * half + 1))[
+        rows, columns].reshape(len(rows), (2 * half + 1) ** 2)
+    norms = squares.shape[1] ** 0.5 * np.maximum(squares.std(axis=1, dtype=float), 1e-3)
+    similar = best[rows, columns] > CORRELATION * norms
+    if np.count_nonzero(similar) > most:
+        raise too_many(most)
+    near = squares[similar] @ np.stack([template.square.ravel() for template in templates]).T
+    which = np.argmax(np.abs(near) if sign == 0 else near, axis=1)
+    return [Candidate(round((column + _vertex(best[row, :], column) + 0.5) * factor - 0.5),
+                      round((row + _vertex(best[:, column], row) + 0.5) * factor - 0.5),
+                      templates[nearest].angle)
+            for row, column, nearest in zip(
+                rows[similar].tolist(), columns[similar].tolist(), which.tolist(), strict=True)]
 
 
 def too_many(most: int) -> InputError:

@@ -4,7 +4,7 @@
 Many marks are fitted at once: arrays have a row for each mark, so that an image of thousands of
 marks costs a fraction of a millisecond each.
 
-The noise of dark and bright pixels is that of the residuals; the covariance of the centre is that
+The noise of dark and bright pixels is that of the residuals; the uncertainty of the centre is that
 of the weighted fit, its Cramér-Rao bound for normal noise.
 """
 
@@ -19,10 +19,10 @@ from selfcal_ros.vision.models import SMALLEST_BLUR, MarkModel
 
 ROUNDS, WEIGHTED_ROUNDS = 25, (2, 8)
 """Largest number of unweighted steps, smallest and largest number of weighted ones."""
-FEW = 600
-"""Pixels of the unweighted fit, at least, where a mark has more."""
-SETTLED = 1e-3
-"""Step of the centre, px, below which the unweighted fit has converged."""
+FEW = 200
+"""Pixels of the unweighted fit, at least, where a mark has more; all if it fails with these."""
+SETTLED = 0.02
+"""Step of the centre, px, below which the unweighted fit has converged, for the weighted one."""
 WEIGHTED_DAMPING = 1e-3
 """Of the weighted steps: a thin line is hard to tell from a wider and fainter one."""
 SETTLED_SIGMAS = 0.1
@@ -39,7 +39,7 @@ ENOUGH = 20
 """Pixels of ground and of mark needed to tell their noises apart."""
 MAD = 1.4826
 """Standard deviation over median absolute deviation, normal noise."""
-TOGETHER = 20_000
+TOGETHER = 40_000
 """Pixels that are fitted at once, about: more do not fit into a processor's cache."""
 LIGHTING = 4
 """Parameters before those of the shape: ground, contrast, slopes of the illumination."""
@@ -81,8 +81,8 @@ class Fit:
     ----------
     centre : float array (2,)
         Its centre relative to the window's, px.
-    covariance : float array (2, 2)
-        Of the centre, px².
+    sigmas : tuple (2,)
+        Standard uncertainties of the centre, px.
     shape : dict
         Name of a shape parameter -> its value.
     contrast, noise : float
@@ -95,7 +95,7 @@ class Fit:
     """
 
     centre: np.ndarray
-    covariance: np.ndarray
+    sigmas: tuple[float, float]
     shape: dict[str, float]
     contrast: float
     noise: float
@@ -155,7 +155,11 @@ def fit_marks(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fi
 
 def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit | None]:
     found: list[Fit | None] = [None] * len(starts)
-    parameters, settled = _settled(model, windows, starts)
+    step = max(1, windows.values.shape[1] // FEW)
+    parameters, settled = _settled(model, windows, starts, step)
+    if step > 1 and not settled.all():
+        noisy = Windows(windows.disc, windows.values[~settled])
+        parameters[~settled], settled[~settled] = _settled(model, noisy, starts[~settled], 1)
     settled &= parameters[:, 3] != 0
     which = np.flatnonzero(settled)
     some = Windows(windows.disc, windows.values[which])
@@ -235,13 +239,13 @@ def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
     return ~(near & (np.abs(p[:, 2 + LIGHTING:]).max(axis=1) < 10 * radius))
 
 
-def _settled(model: MarkModel, windows: Windows, starts: np.ndarray,
+def _settled(model: MarkModel, windows: Windows, starts: np.ndarray, step: int,
              ) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters of the unweighted fits, and which converged (Marquardt).
 
-    They are a start for the weighted ones: some of the pixels of a large mark serve.
+    They are a start for the weighted ones: every `step`-th pixel of a mark serves.
     """
-    some = slice(None, None, max(1, windows.values.shape[1] // FEW))
+    some = slice(None, None, step)
     u, v, values = windows.disc.u[some], windows.disc.v[some], windows.values[:, some]
     radius = windows.disc.inside.shape[0] / 2
     p = _first(model.shape(u, v, starts.T[..., None])[0], values, starts)
@@ -253,18 +257,18 @@ def _settled(model: MarkModel, windows: Windows, starts: np.ndarray,
         if not len(running):
             break
         sigmas, _, scale = _solved(jacobian[running], residual[running], damping[running])
-        step = sigmas / scale
-        tried = p[running] + step
+        change = sigmas / scale
+        tried = p[running] + change
         tried[:, -1] = np.maximum(tried[:, -1], SMALLEST_BLUR)
         possible = ~_diverged(tried, radius)
         if "width" in model.names:
             possible &= (tried[:, 6:8] > 0).all(axis=1)
-        lost = np.isnan(step).any(axis=1)
+        lost = np.isnan(change).any(axis=1)
         image, new_jacobian, _ = _image(model, u, v, np.where(possible[:, None], tried, p[running]))
         new_residual = values[running] - image
         new_cost = _dot(new_residual, new_residual)
         better = possible & (new_cost <= cost[running])
-        small = np.hypot(step[:, 0], step[:, 1]) < SETTLED
+        small = np.hypot(change[:, 0], change[:, 1]) < SETTLED
 
         taken = running[better]
         p[taken], residual[taken], jacobian[taken] = (
@@ -347,18 +351,19 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
 def _fits(model: MarkModel, windows: Windows, p: np.ndarray,
           modelled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
           normal_and_scale: tuple[np.ndarray, np.ndarray]) -> list[Fit | None]:
-    """Return the fits of marks that have settled; None where a covariance is not known."""
+    """Return the fits of marks that have settled; None where the uncertainty is not known."""
     image, shape, residual, variance = modelled
     normal, scale = normal_and_scale
-    inverse = _each(np.linalg.inv, normal)[:, :2, :2]
-    covariance = inverse / scale[:, :2, None] / scale[:, None, :2]
+    variances = np.diagonal(_each(np.linalg.inv, normal), axis1=1, axis2=2)[:, :2]
+    sigmas = np.sqrt(variances) / scale[:, :2]
     away = windows.values - windows.values.mean(axis=1, keepdims=True)
     explained = 1 - _dot(residual, residual) / np.maximum(_dot(away, away), 1e-300)
     noise = np.sqrt(_medians(variance))
     stains = _stains(windows, image, shape, p)
-    return [Fit(p[i, :2], covariance[i], dict(zip(model.names, p[i, 6:].tolist(), strict=True)),
-                float(p[i, 3]), float(noise[i]), float(explained[i]), *stains[i].tolist())
-            if np.isfinite(covariance[i]).all() else None for i in range(len(p))]
+    return [Fit(p[i, :2], tuple(sigmas[i].tolist()),
+                dict(zip(model.names, p[i, 6:].tolist(), strict=True)), float(p[i, 3]),
+                float(noise[i]), float(explained[i]), *stains[i].tolist())
+            if np.isfinite(sigmas[i]).all() else None for i in range(len(p))]
 
 
 def _stains(windows: Windows, image: np.ndarray, shape: np.ndarray, p: np.ndarray) -> np.ndarray:
