@@ -16,9 +16,6 @@ from selfcal_ros.machine import Machine, MachineError
 from selfcal_ros.machine.measuring import Run
 from test.support.cells import CELL, Agreeing, Jumping, write_cell
 from test.support.pages import PAGES, ROOT, lines_of
-from test.support.sessions import collected, events_of, small_plan
-
-TOPIC = ("/stage/joint_states", "sensor_msgs/msg/JointState")
 
 
 def snippets(name: str) -> list[str]:
@@ -42,7 +39,7 @@ def run(tmp_path, monkeypatch):
 
 def test_every_page_with_python_is_run_here():
     assert {page.name for page in PAGES if "```python" in page.read_text()} == {
-        "apply.md", "bags.md", "cal.md", "estimation.md", "machines.md"}
+        "apply.md", "machines.md"}
 
 
 def test_machines(run, tmp_path):
@@ -76,36 +73,11 @@ def test_machines(run, tmp_path):
     assert collect_bag(tmp_path / "bag", CollectorSettings()).measurements.views[0].count.sum() > 5
 
 
-def test_estimation(run):
-    measurements = collected(events_of(small_plan("0, 90, 180, tx")))[1]
-    found = run("estimation.md", measurements=measurements)
-    assert np.isnan(found["result"].error_map.u_gx).all()  # the last line asks for the map only
-
-
-def test_cal(run, tmp_path):
-    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "R.json"]) == 0
-    assert main(["cal", "export", "R.json", "--x-axis", "1", "--y-axis", "2",
-                 "-o", "stage.cal"]) == 0
-    x = np.array([0.0, 1.5, -2.0])
-    found = run("cal.md", x_positions=x, y_positions=x[::-1])
-    assert all(np.isfinite(values).all() and values.shape == x.shape
-               for values in found["corrections"].values())
-
-
 def test_apply(run):
     assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "RESULT.json"]) == 0
     found = run("apply.md")
     np.testing.assert_allclose((found["x_true"], found["y_true"]), (0.01, -0.005), atol=1e-15)
     assert found["covariance"].shape == (4, 4) and found["qualified"]
-
-
-def test_bags(run, tmp_path):
-    given = {"folder": tmp_path / "journals", "now_ns": 1_700_000_000_000_000_000,
-             "qos": "", "data": b"\0\1\0\0", "receive_time_ns": 1_700_000_000_000_000_000}
-    first = run("bags.md", **given)["journal"]
-    second = run("bags.md", **given)["journal"]  # no command ended the plan: it is taken up
-    assert first.path == second.path
-    assert len(list(first.path.glob("*.mcap"))) == 2
 
 
 def targets() -> set[str]:
