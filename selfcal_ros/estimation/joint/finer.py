@@ -125,7 +125,8 @@ def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
     equations = equations_of(problem, found, columns)
     now = score(equations, found.both_residuals, squares(problem, found),
                 coefficients=model.coefficients)
-    values = next_coefficients(equations, now, model.coefficients, found.xy.sigma)
+    values = next_coefficients(equations, now, model.coefficients, sigma_m=found.xy.sigma,
+                               inverse=equations.inverse(found.xy.sigma))
     y = np.where(problem.system.grid.read, model.y - columns.shapes.combined(
         values - model.coefficients), 0.0)
     found = fit(problem, y)

@@ -22,7 +22,6 @@ from selfcal_ros.estimation.joint.problem import FLOOR, ROUNDING, Problem, grid_
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     TermEquations,
-    free_inverse,
     next_coefficients,
     residual_sums,
     score,
@@ -285,9 +284,9 @@ class _State:
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
                     coefficients=self.coefficients)
-        inverse = free_inverse(equations)
-        sums = residual_sums(equations, now, inverse)
-        total, dof = _of_lines(self.problem, self.found, equations, inverse, inverse @ now.total)
+        sums = residual_sums(equations, now)
+        total, dof = _of_lines(self.problem, self.found, equations,
+                               equations.free_inverse @ now.total)
         if sums.dof_between - dof < FEW_DOF or total > sums.between:
             total, dof = 0.0, 0.0
         residuals = sigma_of(sums.between - total, sums.dof_between - dof)
@@ -297,12 +296,14 @@ class _State:
             repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
             else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
-        self.coefficients = next_coefficients(equations, now, self.coefficients, sigma)
+        inverse = equations.inverse(sigma)
+        self.coefficients = next_coefficients(equations, now, self.coefficients, sigma_m=sigma,
+                                              inverse=inverse)
         lines = equations.columns.lines
         if len(lines.at):
             taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
             own = equations.columns.having(lambda block: block.of_lines and not block.between)
-            within = equations.inverse(sigma)[np.ix_(own, own)]
+            within = inverse[np.ix_(own, own)]
             dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
             angular = replace(self.problem.angular, y=self.lines_read - taken)
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
@@ -350,7 +351,7 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     return total, dof
 
 
-def _of_lines(problem: Problem, found: JointFit, equations: TermEquations, inverse: np.ndarray,
+def _of_lines(problem: Problem, found: JointFit, equations: TermEquations,
               more: np.ndarray) -> tuple[float, float]:
     """Return the part of lines in `squares` and their degrees of freedom, all columns free.
 
@@ -361,8 +362,8 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations, inver
     ----------
     problem, found, equations : Problem, JointFit, TermEquations
         A solution, and the columns about it.
-    inverse, more : float arrays (p, p), (p,)
-        `free_inverse` of the columns, and their free coefficients less those of the solution.
+    more : float array (p,)
+        Free coefficients of the columns less those of the solution.
     """
     if not found.ratio > 0:
         return 0.0, 0.0
@@ -370,6 +371,6 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations, inver
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
     weight = equations.line_weight * angular.weight
     rotations = found.ratio * found.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
-    followed = np.einsum("vk,vkp,vkq->pq", weight, columns, columns) * inverse
+    followed = np.einsum("vk,vkp,vkq->pq", weight, columns, columns) * equations.free_inverse
     return (float((weight * (found.residuals_theta - columns @ more) ** 2).sum()),
             angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()))

@@ -91,13 +91,27 @@ class TermEquations:
         Orthonormal in scaled coefficients (times `norm`); others are taken as known. Eigenvalues
         up to `limit`, by default that of `rows`, count as zero.
         """
-        scale = self.norm[rows]
-        scaled = self.information[np.ix_(rows, rows)] / np.outer(scale, scale)
-        values, vectors = np.linalg.eigh(scaled)
+        values, vectors = self._spectrum if rows.all() else self._spectrum_of(rows)
         hidden = values <= (self.limit(rows) if limit is None else limit)
         out = np.zeros((len(rows), int(hidden.sum())))
         out[rows] = vectors[:, hidden]
         return out
+
+    @cached_property
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues and eigenvectors of the scaled equations of all coefficients."""
+        return self._spectrum_of(np.ones(self.n, dtype=bool))
+
+    def _spectrum_of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scale = self.norm[rows]
+        values, vectors = np.linalg.eigh(
+            self.information[np.ix_(rows, rows)] / np.outer(scale, scale))
+        return values, vectors
+
+    @cached_property
+    def _untold_free(self) -> np.ndarray:
+        """Undetermined combinations of the free coefficients, (p, k)."""
+        return self.untold(self.free)
 
     def limit(self, rows: np.ndarray) -> float:
         """Return the eigenvalue of the scaled equations of `rows` that counts as zero."""
@@ -207,7 +221,7 @@ class TermEquations:
         scale = np.where(self.free, 1 / self.norm, self.columns.size)
         matrix = self.unbiased * np.outer(scale, scale)
         matrix[np.diag_indices(len(scale))] += self.prior(sigma_m) * scale**2
-        hold = self.untold(self.free)
+        hold = self._untold_free
         # sized coefficients may be determined far better than free ones in these units; the
         # diagonal of an undetermined free one is rounding
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
@@ -218,6 +232,14 @@ class TermEquations:
         found /= np.outer(own, own)
         told = np.eye(self.n) - hold @ hold.T
         return told @ found @ told * np.outer(scale, scale)
+
+    @cached_property
+    def free_inverse(self) -> np.ndarray:
+        """Pseudo-inverse of the information: covariance of free coefficients, (p, p)."""
+        untold = self.untold(np.ones(self.n, dtype=bool))
+        scaled = self.information / np.outer(self.norm, self.norm)
+        held = np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
+        return held / np.outer(self.norm, self.norm)
 
     def rank(self) -> int:
         """Return the number of combinations of all coefficients determined by the readings."""
@@ -298,11 +320,12 @@ def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
     return Score(between, within.right - within.gram @ taken, sums)
 
 
-def residual_sums(equations: TermEquations, found: Score, inverse: np.ndarray) -> Sums:
-    """Return the residuals of all columns with free coefficients, given their `free_inverse`.
+def residual_sums(equations: TermEquations, found: Score) -> Sums:
+    """Return the residuals of all columns with free coefficients.
 
     The noise comes from this fit: a size that is too small would leave part of its term.
     """
+    inverse = equations.free_inverse
     more = inverse @ found.total
     gram, within = equations.projected.gram, equations.columns.within.gram
     between = found.sums.between - 2 * more @ found.between + more @ gram @ more
@@ -311,17 +334,8 @@ def residual_sums(equations: TermEquations, found: Score, inverse: np.ndarray) -
                 max(float(inner), 0.0), found.sums.dof_within - float(np.sum(inverse * within)))
 
 
-def free_inverse(equations: TermEquations) -> np.ndarray:
-    """Return the pseudo-inverse of the information: covariance of free coefficients."""
-    everything = np.ones(equations.n, dtype=bool)
-    untold = equations.untold(everything)
-    scaled = equations.information / np.outer(equations.norm, equations.norm)
-    held = np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
-    return held / np.outer(equations.norm, equations.norm)
-
-
-def next_coefficients(equations: TermEquations, found: Score, coefficients: np.ndarray,
-                      sigma_m: float) -> np.ndarray:
+def next_coefficients(equations: TermEquations, found: Score, coefficients: np.ndarray, *,
+                      sigma_m: float, inverse: np.ndarray) -> np.ndarray:
     """Return the coefficients from the score, (p,), with sizes as prior knowledge.
 
     Parameters
@@ -334,6 +348,8 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
         Present coefficients of the estimate.
     sigma_m : float
         Noise of one grid reading, m.
+    inverse : float array (p, p)
+        `TermEquations.inverse` of it.
     """
     right = equations.unbiased_sums(found.total)
     everything = np.ones(equations.n, dtype=bool)
@@ -341,7 +357,7 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
     if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
         right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
     prior = equations.prior(sigma_m)
-    return coefficients + equations.inverse(sigma_m) @ (right - prior * coefficients)
+    return coefficients + inverse @ (right - prior * coefficients)
 
 
 def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:

@@ -30,7 +30,7 @@ from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations, free_inverse
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
 from selfcal_ros.estimation.terms.sizes import DOUBT_LEVEL
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
@@ -246,7 +246,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     if not scale or not np.isfinite(model.found.xy.sigma):
         return []
     hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
-    variance = free_inverse(equations)[scale[0], scale[0]] * model.found.xy.sigma**2
+    variance = equations.free_inverse[scale[0], scale[0]] * model.found.xy.sigma**2
     return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
 
 
