@@ -139,7 +139,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if not spread > max(2 * noise, ROUNDING):
         return None
     grid = artifact.map_grid
-    sizes = max(noise, spread / 1000), spread, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0
+    sizes = max(noise, spread / 1000), spread, _alike(
+        views, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0)
     planned, square = _likelihood(views, *sizes)
     if square < EXPLAINED:
         return None
@@ -168,8 +169,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     return Misplaced.of(view.plan_view, before, pose, gain)
 
 
-def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, float], least: float,
-              enough: float) -> Mirrored | None:
+def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, np.ndarray],
+              least: float, enough: float) -> Mirrored | None:
     """Return the reflections that gain the most, if that is more than `least`."""
     gains = {}
     for name, of in MIRRORS.items():
@@ -285,23 +286,37 @@ def _motion(seen: _Seen) -> np.ndarray:
     return np.stack([np.ones(len(z)), z, z.conj(), z * z, z * z.conj(), z.conj() ** 2], axis=1)
 
 
-def _likelihood(views: list[_Seen], noise: float, spread: float,
-                nodes: float) -> tuple[float, float]:
-    """Return the log-likelihood of all readings, and their mean standardised square.
+def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
+    """Return the correlation of the stage's errors at the places of all readings, (n, n).
 
-    Each view's own parameters are removed. `nodes`: distance of the nodes of the map, in pitches;
-    0 on the lattice.
+    Neither another pose of the plate nor a mirrored frame changes it.
+
+    Parameters
+    ----------
+    views : list of _Seen
+        Readings.
+    nodes : float
+        Distance of the nodes of the map, in pitches; 0 on the lattice.
     """
     site = np.concatenate([seen.place for seen in views])
+    if not nodes:
+        return np.equal.outer(site, site)
+    x, y = (np.subtract.outer(part, part) for part in (site.real, site.imag))
+    return np.exp(-(x * x + y * y) / (2 * nodes**2))
+
+
+def _likelihood(views: list[_Seen], noise: float, spread: float,
+                stage: np.ndarray) -> tuple[float, float]:
+    """Return the log-likelihood of all readings, and their mean standardised square.
+
+    Each view's own parameters are removed. `stage`: see `_alike`.
+    """
     turn = np.concatenate([np.full(len(seen.place), seen.pose.phase) for seen in views])
     mark = np.round(np.concatenate([seen.marks for seen in views]), 3)
-    scale = spread**2 / 2
-    stage = np.exp(-np.abs(site[:, None] - site) ** 2 / (2 * nodes**2)) if nodes else (
-        site[:, None] == site)
-    covariance = scale * stage + scale * (
-        mark[:, None] == mark) * turn[:, None] * turn.conj()
-    covariance[np.diag_indices(len(site))] += noise**2
-    free, start = np.zeros((len(site), FREE * len(views)), dtype=complex), 0
+    covariance = spread**2 / 2 * (
+        stage + np.equal.outer(mark, mark) * np.multiply.outer(turn, turn.conj()))
+    covariance[np.diag_indices(len(mark))] += noise**2
+    free, start = np.zeros((len(mark), FREE * len(views)), dtype=complex), 0
     for number, seen in enumerate(views):
         end = start + len(seen.place)
         free[start:end, FREE * number:FREE * (number + 1)] = _motion(seen)
@@ -314,7 +329,7 @@ def _likelihood(views: list[_Seen], noise: float, spread: float,
               - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)
     likelihood = (-square / 2 - 2 * np.log(np.diag(factor).real).sum()
                   - np.linalg.slogdet(inner[:, :-1])[1])
-    return float(likelihood), float(square / 2 / (len(site) - free.shape[1]))
+    return float(likelihood), float(square / 2 / (len(mark) - free.shape[1]))
 
 
 def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:
