@@ -2,6 +2,7 @@
 """The public call of the estimators: readings in, calibration out."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from selfcal_ros.estimation.joint.camera import (
 )
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
+from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -91,10 +93,13 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         options = replace(options, assumed=tuple(
             known if term.block.of_offsets else term for term in options.assumed))
     solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
+    joint, converged = options.method == "joint", solved.converged
+    if joint and not converged:  # first: with a wrong wiring the search for causes takes seconds
+        _check_turned(measurements, options, contradicted=True)
     solved = judged(solved, measurements, options)
     result = solved.result
-    if options.method == "joint" and not _agree(result):
-        _check_turned(measurements, options, result)
+    if joint and converged and not _agree(result):
+        _check_turned(measurements, options, contradicted=bool(result.verdict.failed))
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
     shown = {} if camera is None else camera.to_dict()
@@ -142,22 +147,30 @@ def _agree(result: CalibrationResult) -> bool:
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
-def _check_turned(measurements: Measurements, options: Options,
-                  as_given: CalibrationResult) -> None:
-    """Raise WiringError if the readings agree with another wiring of the offsets."""
+def _check_turned(measurements: Measurements, options: Options, *, contradicted: bool) -> None:
+    """Raise WiringError if the readings agree with another wiring of the offsets.
+
+    `contradicted`: whether a test failed with the wiring as it is. An effect beyond U leaves a
+    result unqualified, and contradicts no wiring.
+    """
     if not shows_offsets(measurements):
         return
-    # an effect beyond U leaves a result unqualified, and contradicts no wiring
-    contradicted = options.finite_rotations and bool(as_given.verdict.failed)
 
-    def agree(wiring: Turned, options: Options) -> bool:
+    @cache
+    def solution(wiring: Turned) -> tuple[Solved, Measurements] | None:
         turned = turned_readings(measurements, wiring)
         try:
             solved = solve_joint(turned, options)
         except NotSettledError:
+            return None
+        return (solved, turned) if solved.converged else None
+
+    def agree(wiring: Turned, options: Options) -> bool:
+        if (found := solution(wiring)) is None:
             return False
-        result = judged(solved, turned, options).result
-        return _agree(result) or (contradicted and not result.verdict.failed)
+        result = judged(*found, options, advise=False).result
+        explained = contradicted and options.finite_rotations and not result.verdict.failed
+        return _agree(result) or explained
 
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks

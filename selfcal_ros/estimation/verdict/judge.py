@@ -81,7 +81,8 @@ FEW_OUTLIERS, MANY_OUTLIERS = 5, 0.1
 
 
 @one_thread()
-def judged(solved: Solved, measurements: Measurements, options: Options) -> Solved:
+def judged(solved: Solved, measurements: Measurements, options: Options, *,
+           advise: bool = True) -> Solved:
     """Return the solution that allows for causes, its result with its verdict as data.
 
     Parameters
@@ -90,6 +91,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
         The solution.
     measurements, options : Measurements, Options
         Its readings, and how they were solved.
+    advise : bool
+        Whether remedies of causes are tried.
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
@@ -104,7 +107,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options) -> Solv
     if not solved.converged:
         failed.append(Finding("not_converged"))
     failed += _sign_findings(checked, measurements, options)
-    searched = search_causes(checked, measurements, options, failed=bool(noises))
+    searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
     zero = {str(term.name) for term in options.terms if term.size == 0}
     causes = tuple(replace(cause, details={**cause.details, "declared": 0.0})
                    if str(cause.name) in zero else cause for cause in searched.causes)
