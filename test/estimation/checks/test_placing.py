@@ -124,9 +124,8 @@ def test_it_is_told_before_a_view_is_complete():
 @pytest.mark.parametrize("text", ["0, 90, tx", "0, 90, 180, tx, ty"])
 def test_plates_that_lie_as_planned_are_no_finding(text):
     for seed in range(10):
+        readings = collect(scene(text, with_ids=False, seed=seed, **NOISE).events)[0]
         for size in (1.0, 0.1, 0.01):
-            cell = scene(text, with_ids=False, seed=seed, **NOISE)
-            readings = collect(cell.events)[0]
             views = tuple(replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views)
             assert misplaced(replace(readings, views=views)) is None
             assert misplaced(unrepeated(replace(readings, views=views))) is None
