@@ -14,7 +14,7 @@ from selfcal_ros.cli.processes import ended_by_signals, need_ros, process, ros_a
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.machine.cell import open_machine, read_cell, with_values
+from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
 from selfcal_ros.outputs import write_bytes
 from selfcal_ros.units import M_PER_UM
@@ -62,8 +62,7 @@ def _try(args: argparse.Namespace) -> int:
     """Look, move after a yes, write what was found into CELL.yaml."""
     cell = read_cell(args.cell)
     output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
-    machine = open_machine(cell)
-    try:
+    with connected(cell, lambda line: print(line, file=aside(args))) as machine:
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
         pixels, marks = trial.look()
         print("position: " + ", ".join(f"{axis} {value:.6g}" for axis, value in zip(
@@ -76,8 +75,6 @@ def _try(args: argparse.Namespace) -> int:
             say(args, "nothing was moved or written", {"marks": len(marks)})
             return int(ExitCode.DONE)
         found = trial.move()
-    finally:
-        machine.close()
     values, notes = values_of(found)
     if values:
         with_values(cell.path, "detector", values, notes)

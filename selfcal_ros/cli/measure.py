@@ -12,8 +12,8 @@ from selfcal_ros.cli.terminal import add_json, aside
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.errors import InputError
-from selfcal_ros.machine.cell import open_machine, read_cell
+from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.machine.cell import connected, read_cell
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
@@ -49,22 +49,20 @@ def run(args: argparse.Namespace) -> int:
     if args.yes and cell.placing == "person":
         raise InputError(f"{cell.path}: placing", "--yes, but a person places the plate",
                          "write placing: robot, or leave out --yes")
-    machine = open_machine(cell)
     try:
-        work = Run(plan, cell, machine, bag, desk)
-        work.require()
-        work.measure(resume=args.resume)
-    except MachineError as error:
+        with connected(cell, desk.say) as machine:
+            work = Run(plan, cell, machine, bag, desk)
+            work.require()
+            work.measure(resume=args.resume)
+    except (MachineError, NoDataError) as error:
         desk.end()
         kept = "; what was measured is kept, --resume continues" if bag.exists() else ""
-        raise InputError(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
+        kind = NoDataError if isinstance(error, NoDataError) else InputError
+        raise kind(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
     except KeyboardInterrupt:
-        machine.stop()
         desk.end()
         print(f"selfcal measure: stopped; {bag} is kept, --resume continues", file=sys.stderr)
         raise
-    finally:
-        machine.close()
     desk.end()
     if plan.verify:
         parser = argparse.ArgumentParser()

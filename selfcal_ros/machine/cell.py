@@ -7,7 +7,8 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +17,7 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, did_you_mean, first_line, known_are
 from selfcal_ros.files import read_text, read_yaml
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Machine, MachineError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.outputs import write_text
@@ -122,14 +124,20 @@ class Cell:
         """Return the position in the stage frame of a machine's position."""
         return value - self.origin.get(axis, 0.0)
 
-    def require_limits(self, axis: str, value: float, what: str) -> None:
-        """Raise MachineError for a machine's position that is not a number or leaves the limits."""
+    def require_limits(self, axis: str, value: float, what: str,
+                       start: float | None = None) -> None:
+        """Raise MachineError for a machine's position that is not a number or leaves the limits.
+
+        From a `start` beyond the limits a move back towards them is allowed.
+        """
         if not math.isfinite(value):
             raise MachineError(f"{what}: {axis} = {value} is not a position", str(self.path))
         if axis not in self.limits:
             raise MachineError(f"{what} moves {axis}, which has no limits", f"{self.path}: limits",
                                f"give limits: {{{axis}: [low, high]}}")
         low, high = self.limits[axis]
+        if start is not None and (start < value < low or high < value < start):
+            return
         if not low <= value <= high:
             raise MachineError(
                 f"{what} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
@@ -235,7 +243,7 @@ def open_machine(cell: Cell) -> Machine:
     keys = dict(cell.keys)
     if "folder" in inspect.signature(kind).parameters and "folder" not in keys:
         keys["folder"] = str(cell.path.parent)
-    machine = kind(**keys)
+    machine = called(f"{cell.path}: {cell.machine}", kind, **keys)
     for name in ("axes", "position", "move_to", "image", "offsets", "stop", "close"):
         if not hasattr(machine, name):
             raise InputError(f"{cell.path}: machine", f"{cell.machine} has no '{name}'",
@@ -245,6 +253,22 @@ def open_machine(cell: Cell) -> Machine:
         raise InputError(f"{cell.path}: machine", f"the axes of {cell.machine} are {axes}",
                          "let them be ('x', 'y') or ('x', 'y', 'theta')")
     return cast(Machine, machine)
+
+
+@contextmanager
+def connected(cell: Cell, say: Callable[[str], None]) -> Iterator[Machine]:
+    """Yield the machine of a cell and release it; `say` takes a line if that fails.
+
+    Raises like `open_machine`.
+    """
+    machine = open_machine(cell)
+    try:
+        yield machine
+    finally:
+        try:
+            machine.close()
+        except Exception as error:
+            say(f"note: machine.close: {type(error).__name__}: {first_line(error)}")
 
 
 def class_of(cell: Cell) -> Any:

@@ -14,7 +14,7 @@ from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again, Duty
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
 from selfcal_ros.machine.measuring import place_by_robot
-from selfcal_ros.machine.visiting import Visitor, stops
+from selfcal_ros.machine.visiting import Visitor
 
 IDLE_S = 0.05
 """Time between two readings of the position while nothing is to be done."""
@@ -143,14 +143,11 @@ class Driver:
         if self._unplaced:
             raise MachineError("the robot has not placed the plate", f"view '{view.name}'",
                                "redo_view has it placed again")
-        if again is None:
-            route = stops(artifact, view, self._cell.sense)
-            self._visitor.require(route)
-            if view.grid:
-                self.events.append(self._visitor.go(route[0].target))
-            self._visitor.first_move(marks=view.grid)
-        for event in self._visitor.view(artifact, view, again):
-            self.events.append(event)
+        with self._visitor.stopping():
+            if again is None:
+                self._visitor.approach(artifact, view)
+            for event in self._visitor.view(artifact, view, again):
+                self.events.append(event)
 
     def close(self) -> None:
         """Stop, and release the machine."""

@@ -139,12 +139,36 @@ def _from_si(axis: str, value: float) -> float:
 class _Talk:
     """How a dialect moves, stops and tells its position."""
 
+    GREETING = ""
+    """How the first line after a reset begins."""
+
     def __init__(self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]) -> None:
         self._lines, self._axes, self._passwords = lines, axes, passwords
+        self._may_greet = True  # it is being reset, or may have been before
         self._begin()
+        self._may_greet = False
 
     def _begin(self) -> None:
         """Bring the controller to mm and absolute coordinates."""
+
+    def _receive(self, timeout_s: float | None = None) -> str:
+        """Return the next line.
+
+        Raises
+        ------
+        MachineError
+            If it shows that the controller was reset, or is not text.
+        """
+        answer = self._lines.receive(timeout_s)
+        if self._may_greet:
+            self._may_greet = not (self.GREETING and answer.startswith(self.GREETING))
+        elif self.GREETING and answer.startswith(self.GREETING):
+            raise MachineError(f"the controller was reset: it says '{answer}'", "controller",
+                               "home it: its position may be lost")
+        elif "\N{REPLACEMENT CHARACTER}" in answer:
+            raise MachineError(f"'{answer:.40}' is not an answer", "controller",
+                               "check baud, cable and its shield")
+        return answer
 
     def _ok(self, line: str, timeout_s: float = PATIENCE_S) -> list[str]:
         """Send a line, return what comes before its ``ok``."""
@@ -152,7 +176,7 @@ class _Talk:
         before: list[str] = []
         deadline = time.monotonic() + timeout_s
         while True:
-            answer = self._lines.receive(max(deadline - time.monotonic(), 0.01))
+            answer = self._receive(max(deadline - time.monotonic(), 0.01))
             if answer.lower() == "ok" or answer.lower().startswith("ok "):
                 return before
             self._refuse(answer, line)
@@ -171,6 +195,8 @@ class _Talk:
 
 class _Grbl(_Talk):
     """GRBL 1.1: real-time status reports ``<Idle|MPos:1.000,2.000,0.000|...>``."""
+
+    GREETING = "Grbl "
 
     def _begin(self) -> None:
         self._lines.send("")
@@ -192,7 +218,7 @@ class _Grbl(_Talk):
         self._lines.send_raw(STATUS)
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
-            answer = self._lines.receive()
+            answer = self._receive()
             if answer.startswith("<"):
                 return self._parsed(answer)
             self._refuse(answer, "?")
@@ -237,6 +263,7 @@ class _Grbl(_Talk):
     def stop(self) -> None:
         self._lines.send_raw(FEED_HOLD)
         time.sleep(HOLD_S)
+        self._may_greet = True
         self._lines.send_raw(RESET)
 
 
@@ -247,6 +274,7 @@ class _Marlin(_Talk):
     """
 
     QUERY, HALT, STEPS = "M114 R", b"M410\n", "M92"
+    GREETING = "start"
 
     def _begin(self) -> None:
         self._lines.forget()
@@ -281,6 +309,7 @@ class _Klipper(_Marlin):
     """Klipper's serial port (/tmp/printer): ``M114``; ``M112`` is its only stop."""
 
     QUERY, HALT, STEPS = "M114", b"M112\n", ""
+    GREETING = ""
 
 
 class _LinuxCnc(_Talk):
@@ -335,7 +364,11 @@ NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")
 
 
 def _numbers(text: str) -> list[float]:
-    return [float(part) for part in text.split(",")]
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise MachineError(f"'{text}' is not a position", "controller",
+                           "check baud, cable and its shield") from None
 
 
 _TALKS: dict[str, type] = {"grbl": _Grbl, "marlin": _Marlin, "klipper": _Klipper,

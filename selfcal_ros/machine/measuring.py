@@ -26,13 +26,20 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, said
 from selfcal_ros.estimation.checks.wiring import check_wiring
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
+from selfcal_ros.machine.contradicting import LEAST_VISITS, Contradiction, contradiction
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
 from selfcal_ros.machine.visiting import Visitor, stops
 from selfcal_ros.messages import from_model
-from selfcal_ros.model.readings import Measurements, placing_digest
+from selfcal_ros.model.readings import (
+    REPEAT_OUTLIER,
+    GridVisits,
+    Measurements,
+    placing_digest,
+)
 from selfcal_ros.model.view import Plan
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
@@ -156,12 +163,13 @@ class Run:
         """
         commands = self._begin(resume)
         try:
-            self._write_all(commands)
-            while self._sequencer.state not in ENDED:
-                if self._sequencer.state is State.PLACING:
-                    self._place()
-                    self._write_all(self._sequencer.confirm())
-                self._measure_view()
+            with self.visitor.stopping():
+                self._write_all(commands)
+                while self._sequencer.state not in ENDED:
+                    if self._sequencer.state is State.PLACING:
+                        self._place()
+                        self._write_all(self._sequencer.confirm())
+                    self._measure_view()
         finally:
             if self._journal is not None:
                 self._journal.close()
@@ -256,6 +264,33 @@ class Run:
         else:
             self.collector.add_encoder(event)
 
+    def _why(self, progress: ViewProgress) -> tuple[str, str]:
+        """Return why marks of a view are not read, to be appended to a sentence, and a remedy."""
+        found = self._contradiction(progress)
+        if found:
+            return f": {found.what}", found.remedy
+        findings = self.collector.findings(*self.collector.collect())
+        finding = findings.get(progress.view_index) or findings.get(None)
+        if finding:
+            return f": {finding}", ""
+        return _rejected(progress), ("clean the plate there, check light and focus, or leave "
+                                     "these marks out of the plan")
+
+    def _contradiction(self, progress: ViewProgress) -> Contradiction | None:
+        """Return why repeats of a view's marks contradict each other, if many do."""
+        if progress.readings.rejected.get(REPEAT_OUTLIER, 0) < LEAST_VISITS:
+            return None
+        visits = self._all_visits(progress.view_index)
+        return contradiction(visits) if visits else None
+
+    def _all_visits(self, index: int) -> GridVisits | None:
+        """Return the visits of a view from the bag, outliers included."""
+        everything = Collector(replace(collector_settings(self.cell), outlier_limit=0.0))
+        feed = block_handlers(everything, [])
+        for topic, item in BagReader(self.bag).columns():
+            feed[topic](item)
+        return everything.collect()[1][index].readings.visits
+
     def _progress(self) -> ViewProgress:
         return self.collector.collect()[1][self._sequencer.index]
 
@@ -268,7 +303,7 @@ class Run:
         if not self.desk.may_move("the stage makes a small move, then goes to its marks"):
             raise InputError(f"view '{view.name}'", "the stage may not move",
                              "continue with --resume")
-        self._check_first(view.grid)
+        self.visitor.approach(self.plan.artifact, view)
         if resumed and self._has_shifted():
             self._write_all(self._sequencer.redo())
             return
@@ -280,15 +315,17 @@ class Run:
             rounds = rounds + 1 if progress.needed >= left else 0
             left = progress.needed
             if rounds >= REVISITS:
+                why, remedy = self._why(progress)
                 raise NoDataError(f"view '{view.name}'", f"{_named(progress)} are not read after "
-                                  f"{rounds} more visits{_rejected(progress)}",
-                                  "clean the plate there, check light and focus, or leave these "
-                                  "marks out of the plan; --resume continues")
+                                  f"{rounds} more visits{why}", remedy)
             missing = progress.missing
             self._visit(Again({*zip(missing.m, missing.n, strict=True)}, {*missing.k},
                               progress.check_done < progress.check_expected))
             progress = self._progress()
         self.desk.show(progress)
+        found = self._contradiction(progress)
+        if found:
+            self.desk.say(f"note: view '{view.name}': {found.what}; {found.remedy}")
         measurements, _ = self.collector.collect()
         check_wiring(measurements)
         if self._is_misplaced(measurements, view.name):
@@ -312,14 +349,6 @@ class Run:
             raise error
         self.desk.say(f"{error}; the view is measured anew")
         return True
-
-    def _check_first(self, grid: bool) -> None:
-        """Go to the first mark of the view and make the small first move there."""
-        if grid:
-            route = stops(self.plan.artifact, self.plan.views[self._sequencer.index],
-                          self.cell.sense)
-            self.visitor.go(route[0].target)
-        self.visitor.first_move(marks=grid)
 
     def _visit(self, again: Again | None) -> None:
         """Visit marks of the view, save what is seen, show the progress from time to time."""
@@ -397,7 +426,7 @@ def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
         if place is None:
             raise MachineError("the machine has no method 'place'", f"{cell.path}: placing",
                                "name a command")
-        place(placing)
+        called("machine.place", place, placing)
         return
     words = [word.format(view=placing.view, x=repr(placing.x), y=repr(placing.y),
                          rotation=repr(placing.rotation))

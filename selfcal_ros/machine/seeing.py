@@ -33,6 +33,7 @@ class Eye:
         self._settings, self._where = settings, where
         self._detector: ImageDetector | None = None
         self._before: tuple[np.ndarray, tuple[float, ...]] | None = None
+        self._kind: tuple[object, ...] = ()  # type and size of the first image
         self.newest: np.ndarray | None = None
 
     @property
@@ -84,6 +85,12 @@ class Eye:
         if pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
             raise MachineError(f"an image is {pixels.dtype} {pixels.shape}", "machine.image",
                                "return grey values (h, w), uint8 or uint16")
+        kind = (pixels.dtype, *pixels.shape)
+        self._kind = self._kind or kind
+        if kind != self._kind:
+            raise MachineError(f"an image is {_said(kind)}, those before were {_said(self._kind)}",
+                               "machine.image", "set the camera to one size and type; see whether "
+                               "it was reset")
         full = (self._settings.full_scale if self._settings else 0) or int(
             np.iinfo(pixels.dtype).max)
         last, self._before = self._before, (pixels.copy(), position)
@@ -98,12 +105,21 @@ class Eye:
                                "shorten the exposure, or reduce the light")
         if float(pixels.max()) - float(pixels.min()) < LEAST_RANGE * full:
             shade = "black" if pixels.max() < 0.1 * full else "blank"
-            raise MachineError(f"the image is {shade}", "machine.image",
-                               "check light, shutter, lens cap and exposure time")
+            raise MachineError(f"the image is {shade}, grey values up to {pixels.max()} of {full}",
+                               "machine.image", "check light, shutter, lens cap and exposure time, "
+                               "and full_scale of the detector")
         return Picture(pixels, int(np.iinfo(pixels.dtype).max))
 
 
+def _said(kind: tuple[object, ...]) -> str:
+    dtype, height, width = kind
+    return f"{width} x {height} {dtype}"
+
+
 def _detection(offset: Offset, stamp_ns: int) -> Detection:
+    if not np.isfinite([offset.x, offset.y, offset.theta or 0.0]).all():
+        raise MachineError(f"an offset is x {offset.x}, y {offset.y}, theta {offset.theta}",
+                           "machine.offsets", "leave out what is not seen")
     m, n = offset.mark or (0, 0)
     is_line = offset.theta is not None
     return Detection(

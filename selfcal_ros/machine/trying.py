@@ -101,10 +101,10 @@ class Trial:
         """
         visitor = Visitor(self.machine, self.cell, self.clock)
         self.position = visitor.sample()
-        shown = self.machine.image()
+        shown = visitor.show()
         if not isinstance(shown, Image):
             self._visitor = visitor
-            seen = [(item.x, item.y) for item in self.machine.offsets() if item.theta is None]
+            seen = [(item.x, item.y) for item in shown if item.theta is None]
             if not seen:
                 raise NoDataError("machine.offsets", "no mark is seen", "move to a mark first")
             return None, seen
@@ -156,11 +156,8 @@ class Trial:
         InputError
             If the images contradict the moves.
         """
-        try:
+        with self._visitor.stopping():
             return self._moved()
-        except BaseException:
-            self.machine.stop()
-            raise
 
     def _moved(self) -> Findings:
         visitor = self._visitor

@@ -7,12 +7,15 @@ as commanded stops the machine and raises `MachineError`.
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
-from selfcal_ros.errors import NoDataError
+from selfcal_ros.errors import NoDataError, first_line
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again
@@ -30,15 +33,22 @@ POLL_S = 0.02
 """Time between two readings of the position that show whether the stage rests."""
 TRACK_NS = 40_000_000
 """Largest time between two positions that are published, below the collector's largest gap."""
+TINY = 1e-15
+"""Least tolerance, m or rad: one of 0 is allowed."""
 TRIES = 3
 """Exposures that are tried at a stop whose position changes meanwhile."""
 EMPTY_STOPS = 5
-"""First stops of a view at which nothing is seen, after which it is given up."""
+"""Stops one after another at which nothing is seen, after which a view is given up."""
+FIRST_TURN_RAD = 0.01
+"""First move of a rotary axis."""
 FOLLOWS = 0.25
 """Largest deviation, over the step, of a position or a mark from the step of the stage."""
 UNITS = {1e3: "mm for m", 1e6: "um for m", 1e-3: "m for mm", 1e-6: "m for um",
-         25.4: "inches", 1 / 25.4: "inches"}
+         25.4: "inches", 1 / 25.4: "inches", 1 / 0.0254: "inches for m"}
 """Factor of a position that is given in another unit -> the units."""
+ANGLE_UNITS = {math.degrees(1.0): "degrees for rad", math.radians(1.0): "rad for degrees",
+               1e3: "mrad for rad"}
+"""The same for theta."""
 
 
 @dataclass(frozen=True)
@@ -119,14 +129,77 @@ class Visitor:
         self.axes = tuple(self.machine.axes)
         self.eye = Eye(self.cell.detector, str(self.cell.path))
         self._rng = np.random.default_rng(self.seed)
-        self._last: EncoderSample | None = None
+        self._last: EncoderSample | None = None  # where it was left at rest
+        self._has_moved = False
         self._told_ns = 0  # newest stamp of a position
         self.stopped = False
 
     def stop(self) -> None:
         """Stop the machine, and whatever is being visited; may be called from another thread."""
         self.stopped = True
-        self.machine.stop()
+        self._ask("stop")
+
+    def _ask(self, name: str, *values: Any) -> Any:
+        """Call a method of the machine; its errors become MachineError."""
+        return called(f"machine.{name}", getattr(self.machine, name), *values)
+
+    @contextmanager
+    def stopping(self) -> Iterator[None]:
+        """Stop the machine if anything is raised; say so if it cannot be stopped."""
+        try:
+            yield
+        except BaseException as error:
+            self._has_moved = False  # the next move is a small one again
+            try:
+                self.machine.stop()
+            except Exception as failed:
+                raise MachineError(f"{str(error) or 'interrupted'}; and it cannot be stopped "
+                                   f"({first_line(failed)})", "machine.stop",
+                                   "use the emergency stop") from error
+            raise
+
+    def show(self) -> Image | list[Offset]:
+        """Return what the machine sees now.
+
+        Raises
+        ------
+        MachineError
+            If it shows neither an image nor offsets, or no image after others.
+        """
+        image = self._ask("image")
+        if isinstance(image, Image):
+            return image
+        if image is not None:
+            raise MachineError(f"it returns {type(image).__name__}", "machine.image",
+                               "return Image(pixels), or None without a camera")
+        if self.eye.newest is not None:
+            raise MachineError("it returns no image any more", "machine.image",
+                               "check the camera and its cable")
+        offsets = self._ask("offsets")
+        if not isinstance(offsets, list) or not all(isinstance(each, Offset) for each in offsets):
+            raise MachineError(f"it returns {offsets!r:.50}", "machine.offsets",
+                               "return a list of Offset, empty if nothing is seen")
+        return offsets
+
+    def approach(self, artifact: Artifact, view: View) -> None:
+        """Go to the first stop of a view, and check there that position and marks follow.
+
+        The first move of all is a small one, from where the stage stands.
+
+        Raises
+        ------
+        MachineError
+            If anything is not as commanded.
+        """
+        route = stops(artifact, view, self.cell.sense)
+        self.require(route)
+        self._last = None  # a person may have moved it by hand
+        if not self._has_moved:
+            self.first_move(marks=False, turns=view.angular)
+            self._has_moved = True
+        if view.grid:
+            self.go(route[0].target)
+            self.first_move(marks=True)
 
     def view(self, artifact: Artifact, view: View, again: Again | None = None,
              ) -> Iterator[EncoderSample | Detection]:
@@ -135,28 +208,33 @@ class Visitor:
         Raises
         ------
         MachineError
-            If anything is not as commanded; the machine has been stopped.
+            If anything is not as commanded.
         NoDataError
-            If nothing is seen at the first stops.
+            If nothing is seen at several stops one after another.
         """
         route = stops(artifact, view, self.cell.sense, again=again, rng=self._rng)
         self.require(route)
-        try:
-            empty = 0
-            for number, stop in enumerate(route):
-                for _ in range(stop.exposures):
-                    found = 0
-                    for event in self._visit(stop, only_nearest=view.image is None):
-                        found += isinstance(event, Detection)
-                        yield event
-                    empty = 0 if found else empty + 1
-                if again is None and empty == number + 1 == min(EMPTY_STOPS, len(route)):
-                    raise NoDataError(f"view '{view.name}'", "nothing is seen at the first "
-                                      f"{empty} stops{self.eye.why}", "place the plate as the "
-                                      "view says, check focus, light, and mark_size in CELL.yaml")
-        except BaseException:
-            self.machine.stop()
-            raise
+        empty = 0
+        for number, stop in enumerate(route):
+            for _ in range(stop.exposures):
+                found = 0
+                for event in self._visit(stop, only_nearest=view.image is None):
+                    found += isinstance(event, Detection)
+                    yield event
+                empty = 0 if found else empty + 1
+            if again is None and empty >= min(EMPTY_STOPS, len(route)):
+                raise self._sees_nothing(view, empty, at_first=empty > number)
+
+    def _sees_nothing(self, view: View, empty: int, *, at_first: bool) -> NoDataError:
+        which = "first" if at_first else "last"
+        remedy = ("place the plate as the view says, check focus, light, and mark_size and "
+                  "pixel_size in CELL.yaml" if at_first else
+                  "check light, focus, the camera, and whether the plate is dirty there")
+        if self.cell.detector and self.eye.newest is None:
+            remedy = "the machine returns no images: check the camera, or take detector out of " \
+                     "CELL.yaml"
+        return NoDataError(f"view '{view.name}'", f"nothing is seen at the {which} {empty} stops"
+                           f"{self.eye.why}", remedy)
 
     def require(self, route: Iterable[Stop]) -> None:
         """Refuse a route that leaves the limits or needs an axis that the machine lacks."""
@@ -177,10 +255,14 @@ class Visitor:
             If it is not a position.
         """
         before = self.clock.now_ns()
-        values = tuple(self.machine.position())
+        told = self._ask("position")
         stamp = max((before + self.clock.now_ns()) // 2, self._told_ns + 1)
+        try:
+            values = tuple(map(float, told))
+        except (TypeError, ValueError):
+            values = ()
         if len(values) != len(self.axes) or not all(map(math.isfinite, values)):
-            raise MachineError(f"its position is {values}", "machine.position",
+            raise MachineError(f"its position is {told!r:.100}", "machine.position",
                                f"return {', '.join(self.axes)} in m and rad")
         self._told_ns = stamp
         return EncoderSample(stamp, self.axes, tuple(
@@ -196,21 +278,45 @@ class Visitor:
         MachineError
             If the target is beyond the limits, the position does not follow or does not rest.
         """
-        here = dict(zip(self.axes, (self._last or self.sample()).positions, strict=True))
+        start = self._start()
         if "theta" in self.axes and "theta" in target:
-            turns = round((target["theta"] - here["theta"]) / math.tau)
+            turns = round((target["theta"] - start["theta"]) / math.tau)
             target = target | {"theta": self._within_limits(target["theta"] + turns * math.tau)}
-        goal = here | target
-        wanted = tuple(self.cell.to_machine(axis, goal[axis]) for axis in self.axes)
-        for axis, value in zip(self.axes, wanted, strict=True):
-            if axis in target:
-                self.cell.require_limits(axis, value, "a move")
+        goal = start | target
+        for axis in target:
+            self.cell.require_limits(axis, self.cell.to_machine(axis, goal[axis]), "a move",
+                                     start=self.cell.to_machine(axis, start[axis]))
         if self.stopped:
             raise MachineError("stopped", "a move")
-        self.machine.move_to(wanted)
+        self._ask("move_to", tuple(self.cell.to_machine(axis, goal[axis])
+                                   for axis in self.axes))
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
-        return self._rest(goal, target)
+        return self._rest(start, goal, target)
+
+    def _start(self) -> Position:
+        """Return where the stage rests; raise if it is not where it was left."""
+        now = self.sample()
+        if self._last is not None:
+            self._check_left_alone(_difference(self._last, now))
+        return dict(zip(self.axes, now.positions, strict=True))
+
+    def _check_left_alone(self, moved: Position) -> None:
+        """Raise if the position at rest has changed by more than the tolerance of arrival."""
+        axis = self._farthest(moved)
+        if abs(moved[axis]) > self.cell.settle.of(axis, "arrival"):
+            raise MachineError(f"{axis} has changed by {_shown(axis, moved[axis])} at rest, "
+                               "without a command", "machine.position", "see whether it was moved "
+                               "by hand, was reset, or has lost its zero; home it")
+
+    def _rests(self, moved: Position) -> bool:
+        """Return whether two readings agree."""
+        return all(abs(moved[axis]) <= self.cell.settle.of(axis, "within") for axis in self.axes)
+
+    def _farthest(self, away: Position) -> str:
+        """Return the axis that is farthest off, in units of its tolerance of arrival."""
+        return max(away, key=lambda axis: abs(away[axis]) / max(
+            self.cell.settle.of(axis, "arrival"), TINY))
 
     def _within_limits(self, theta: float) -> float:
         """Return an angle or the same some turns off, within the limits if one is."""
@@ -220,7 +326,7 @@ class Visitor:
             math.floor((high - at) / math.tau) if at > high else 0)
         return theta + turns * math.tau
 
-    def _rest(self, goal: Position, commanded: Position) -> EncoderSample:
+    def _rest(self, start: Position, goal: Position, commanded: Position) -> EncoderSample:
         """Wait until two successive readings agree with each other and with the target."""
         settle = self.cell.settle
         deadline_ns = self.clock.now_ns() + round(settle.patience * NS_PER_S)
@@ -231,7 +337,7 @@ class Visitor:
             moved = _difference(before, now)
             away = {axis: value - goal[axis]
                     for axis, value in zip(self.axes, now.positions, strict=True)}
-            rests = all(abs(moved[axis]) <= settle.of(axis, "within") for axis in self.axes)
+            rests = self._rests(moved)
             arrived = all(abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded)
             if rests and arrived:
                 self._last = now
@@ -239,24 +345,40 @@ class Visitor:
             if self.stopped:
                 raise MachineError("stopped", "a move")
             if now.stamp_ns > deadline_ns:
-                self.machine.stop()
-                raise self._not_at_rest(moved, away) if not rests else self._astray(goal, away)
+                raise self._not_at_rest(before, now) if not rests else self._astray(
+                    start, goal, {axis: away[axis] for axis in self.axes if axis in commanded
+                                  or axis != "theta"})
             before = now
 
-    def _not_at_rest(self, moved: Position, away: Position) -> MachineError:
-        axis = max(self.axes, key=lambda name: abs(moved[name]) / self.cell.settle.of(
-            name, "within"))
+    def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
+        self._check_axes(before, now)
+        moved = _difference(before, now)
+        axis = max(self.axes, key=lambda name: abs(moved[name]) / max(
+            self.cell.settle.of(name, "within"), TINY))
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
             f"by {_shown(axis, moved[axis])}", "machine", "tune the axis, or raise settle: within "
             "or patience in CELL.yaml")
 
-    def _astray(self, goal: Position, away: Position) -> MachineError:
-        axis = max(goal, key=lambda name: abs(away[name]) / self.cell.settle.of(name, "arrival"))
+    def _check_axes(self, before: EncoderSample, now: EncoderSample) -> None:
+        """Raise if two readings at rest differ by an exchange of x and y."""
+        exchanged = replace(now, positions=(*now.positions[1::-1], *now.positions[2:]))
+        if self._rests(_difference(before, exchanged)):
+            raise MachineError("the readings of x and y change places: it answers for the other "
+                               "axis", "machine.position", "wait for each answer before the next "
+                               "question; drop what is left of old answers")
+
+    def _astray(self, start: Position, goal: Position, away: Position) -> MachineError:
+        axis = self._farthest({axis: value for axis, value in away.items()
+                               if goal[axis] != start[axis]} or away)
+        other = {"x": "y", "y": "x"}.get(axis, "")
+        at = goal[axis] + away[axis]
+        reason = _reason(axis, goal[axis] - start[axis], at - start[axis], away.get(other, 0.0))
         return MachineError(
-            f"{axis} was sent to {goal[axis]:.6g} and indicates {goal[axis] + away[axis]:.6g}: "
-            f"{_shown(axis, away[axis])} away after {self.cell.settle.patience:g} s", "machine",
-            "check drives, limit switches and the unit of the positions, or raise settle: arrival")
+            f"{axis} was sent to {goal[axis]:.6g} and indicates {at:.6g} after "
+            f"{self.cell.settle.patience:g} s, {_shown(axis, away[axis])} away"
+            f"{reason and ': '}{reason}", "machine", "check drives, limit switches and the unit of "
+            "the positions, or raise settle: arrival")
 
     def expose(self) -> tuple[EncoderSample, list[Detection], EncoderSample]:
         """Expose at rest: the positions before and after, and what is seen, all marks.
@@ -271,18 +393,17 @@ class Visitor:
             if self.clock.now_ns() - before.stamp_ns > TRACK_NS:
                 before = self.sample()
             began = self.clock.now_ns()
-            shown: Image | list[Offset] | None = self.machine.image()
-            if shown is None:
-                shown = self.machine.offsets()
+            shown = self.show()
             ended = self.clock.now_ns()
             after = self.sample()
             moved = _difference(before, after)
             self._last = after
-            if all(abs(moved[axis]) <= self.cell.settle.of(axis, "within") for axis in self.axes):
+            if self._rests(moved):
                 found = self.eye.detections(shown, (began + ended) // 2, before.positions)
                 self._check_stamps(found, before, after)
                 return before, found, after
-        self.machine.stop()
+            self._check_axes(before, after)
+            self._check_left_alone(moved)
         axis = max(self.axes, key=lambda name: abs(moved[name]))
         raise MachineError(f"{axis} moved by {_shown(axis, moved[axis])} during {TRIES} exposures",
                            "machine", "wait longer: settle: time in CELL.yaml")
@@ -307,13 +428,15 @@ class Visitor:
         yield from _track(at, before)
         yield from _around(before, found, after)
 
-    def first_move(self, *, marks: bool, step_m: float = 0.0) -> None:
+    def first_move(self, *, marks: bool, turns: bool = False, step_m: float = 0.0) -> None:
         """Make a small move along each axis and back; check that position and marks follow.
 
         Parameters
         ----------
         marks : bool
             Whether a mark is in sight whose offset has to follow.
+        turns : bool
+            Whether the rotary axis is moved as well.
         step_m : float
             Length of the move, m; 0 = `Cell.first_step_m`.
 
@@ -326,33 +449,18 @@ class Visitor:
         start = self.sample()
         self._last = start
         home = dict(zip(self.axes, start.positions, strict=True))
-        for axis in ("x", "y"):
+        for axis in ("x", "y", "theta") if turns else ("x", "y"):
             low, high = self.cell.limits[axis]
-            inward = step if self.cell.to_machine(axis, home[axis]) < (low + high) / 2 else -step
-            seen = self._seen() if marks else []
-            at = self._stepped(axis, home, inward)
-            if marks:
-                self._check_marks(axis, at - home[axis], seen, self._seen(), self._seen())
+            length = FIRST_TURN_RAD if axis == "theta" else step
+            at_home = self.cell.to_machine(axis, home[axis])
+            inward = length if at_home < (low + high) / 2 else -length
+            sees = marks and axis != "theta"
+            seen = self._seen() if sees else []
+            at = self.go({axis: home[axis] + inward})
+            if sees:
+                moved = dict(zip(self.axes, at.positions, strict=True))[axis] - home[axis]
+                self._check_marks(axis, moved, seen, self._seen(), self._seen())
             self.go({axis: home[axis]})
-
-    def _stepped(self, axis: str, home: Position, step: float) -> float:
-        """Move one axis; return where it is; raise if the position does not follow."""
-        self.cell.require_limits(axis, self.cell.to_machine(axis, home[axis] + step), "a move")
-        try:
-            return dict(zip(self.axes, self.go({axis: home[axis] + step}).positions,
-                            strict=True))[axis]
-        except MachineError as error:
-            if self.stopped:
-                raise
-            now = dict(zip(self.axes, self.sample().positions, strict=True))
-            moved = {name: now[name] - home[name] for name in ("x", "y")}
-            other = "y" if axis == "x" else "x"
-            reason = _reason(step, moved[axis], moved[other], axis, other)
-            if not reason:
-                raise
-            raise MachineError(f"{axis} was moved by {_shown(axis, step)}: {reason}", "first move",
-                               "correct the machine's keys in CELL.yaml, or its wiring"
-                               ) from error
 
     def _seen(self) -> list[Detection]:
         return [item for item in self.expose()[1] if item.kind == Kind.GRID]
@@ -369,7 +477,6 @@ class Visitor:
         follows = math.hypot(along - expected, across) <= FOLLOWS * abs(step)
         if follows:
             return
-        other = "y" if axis == "x" else "x"
         if abs(along) <= FOLLOWS * abs(step) and abs(again - expected) <= FOLLOWS * abs(step):
             reason, remedy = "the image is late by one frame", (
                 "let the camera expose when it is asked (software trigger), or drop a frame")
@@ -377,7 +484,8 @@ class Visitor:
             reason, remedy = "the marks stand still", (
                 "check that the camera returns new images, and that the stage really moves")
         else:
-            reason = _reason(expected, along, across, axis, other) or (
+            other = "y" if axis == "x" else "x"
+            reason = _reason(axis, expected, along, across) or (
                 f"the marks moved by {_shown(axis, along)} along {axis} and "
                 f"{_shown(other, across)} along {other}")
             remedy = "correct pixel_size, turn, mirror and sense in CELL.yaml: `selfcal cell try`"
@@ -385,22 +493,23 @@ class Visitor:
                            "first move", remedy)
 
 
-def _reason(step: float, along: float, across: float, axis: str, other: str) -> str:
+def _reason(axis: str, step: float, along: float, across: float) -> str:
     """Return why a motion along and across an axis is not the step that was made, "" if unknown."""
     near = FOLLOWS * abs(step)
+    if not step or abs(along - step) <= near:
+        return ""
     if abs(along) <= near and abs(across) <= near:
-        return "nothing moved: its position is frozen, or its drive is off"
+        return ("nothing moved: its position is frozen, its drive is off, or it stands at a limit "
+                "switch")
     if abs(along + step) <= near and abs(across) <= near:
         return f"the opposite direction: {axis} is reversed"
     if abs(along) <= near and abs(abs(across) - abs(step)) <= near:
-        return f"{other} moved instead: the axes are exchanged"
+        return f"{'y' if axis == 'x' else 'x'} moved instead: the axes are exchanged"
     ratio = along / step
-    for factor, units in UNITS.items():
+    for factor, units in (ANGLE_UNITS if axis == "theta" else UNITS).items():
         if abs(ratio / factor - 1) <= FOLLOWS:
             return f"{ratio:.2g} times as far: is it {units}?"
-    if abs(across) <= near and abs(ratio - 1) > FOLLOWS:
-        return f"{ratio:.3g} times as far"
-    return ""
+    return f"{ratio:.3g} times as far" if abs(across) <= near else ""
 
 
 def _change(first: list[Detection], later: list[Detection], axis: str,

@@ -4,13 +4,15 @@
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.machine import MachineError
+from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.machine import MachineError, gcode
 from selfcal_ros.machine.gcode import GcodeMachine
 from selfcal_ros.machine.measuring import Run
 from test.machine.test_measuring import away_from
 from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
-from test.support.firmware import Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
+from test.support.firmware import FaultyGrbl, Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
 
 pytest.importorskip("serial")
 KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
@@ -67,6 +69,26 @@ def test_an_alarm_in_the_middle_stops_and_is_named(dialect):
         with pytest.raises(MachineError, match=r"answered by|state 'alarm'"):
             machine.move_to((0.001, 0.0))
         machine.close()
+
+
+@pytest.mark.parametrize(("fault", "said"), [
+    ("garbage", "is not an answer; check baud"), ("digits lost", "is not a position; check baud"),
+    ("line cut", "it reports 1 axes|no machine position|is not a position"),
+    ("reset", "the controller was reset: it says 'Grbl 1.1h"), ("alarm", "in state 'alarm'"),
+    ("never idle", "the move has not ended in"), ("silent", "no status report|no answer")])
+def test_a_controller_that_fails_in_the_middle_of_a_view(tmp_path, monkeypatch, fault, said):
+    monkeypatch.setattr(gcode, "PATIENCE_S", 0.3)
+    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
+    firmware = FaultyGrbl(fault, after=150)
+    with over_tcp(firmware) as port:
+        machine = WithPlate(simulated, port=port, dialect="grbl")
+        with pytest.raises(MachineError, match=said):
+            Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
+                Agreeing()).measure()
+        machine.close()
+    assert firmware.stopped >= 2 or fault == "silent"  # feed hold and reset
+    readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
+    assert sum(int(view.count.sum()) for view in readings.views) >= 3
 
 
 @pytest.mark.parametrize("over", [over_tcp, over_pty])

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells for tests: a clock without waiting, a machine with faults, a person who agrees."""
+"""Cells for tests: a clock without waiting, a person who agrees, a plate under a controller."""
 
-import numpy as np
-
-from selfcal_ros.machine import Image, MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.gcode import GcodeMachine
 
@@ -98,89 +95,6 @@ class WithPlate(GcodeMachine):
     def image(self):
         self._simulated.move_to((self.position()[0], self.position()[1], 0.0))
         return self._simulated.image()
-
-
-class Spoilt:
-    """A machine with a fault, from the `after`-th call of a method on.
-
-    `fault` is a name in `FAULTS`: what a method of the sound machine returned is changed.
-    """
-
-    def __init__(self, machine, fault: str = "", after: int = 0) -> None:
-        self.machine, self.fault, self.after = machine, fault, after
-        self.axes = machine.axes
-        self.moves, self.stops, self.images = [], 0, 0
-        self._frozen, self._kept = None, None
-        self._offset = np.zeros(len(self.axes))
-
-    @property
-    def is_on(self) -> bool:
-        return len(self.moves) >= self.after
-
-    def place(self, placing) -> None:
-        self.machine.place(placing)
-
-    def position(self):
-        at = np.array(self.machine.position())
-        if self.is_on and self.fault == "frozen position":
-            self._frozen = at if self._frozen is None else self._frozen
-            at = self._frozen
-        if self.is_on and self.fault == "never at rest":
-            self._offset[0] = -self._offset[0] if self._offset[0] else 3e-6
-            at = at + self._offset
-        if self.is_on and self.fault == "position in mm":
-            at = at * 1e3
-        if self.is_on and self.fault == "indicates exchanged axes":
-            at[:2] = at[1::-1]
-        if self.is_on and self.fault == "indicates reversed x":
-            at[0] = -at[0]
-        if self.is_on and self.fault == "no number":
-            at[1] = np.nan
-        return tuple(at.tolist())
-
-    def move_to(self, position) -> None:
-        self.moves.append(position)
-        if self.is_on and self.fault == "lost connection":
-            raise MachineError("the connection was lost", "port /dev/ttyUSB0", "plug it in")
-        if self.is_on and self.fault == "limit switch":
-            position = (min(position[0], 0.0), *position[1:])
-        if self.is_on and self.fault == "stands still":
-            return
-        self.machine.move_to(position)
-
-    def image(self):
-        shown = self.machine.image()
-        self.images += 1
-        if shown is None or not self.is_on:
-            self._kept = shown
-            return shown
-        before, self._kept = self._kept, shown
-        pixels = shown.pixels
-        if self.fault == "last image again":
-            self._kept = before
-            return before
-        if self.fault == "late by one frame":
-            return before or shown
-        if self.fault == "black":
-            return Image(np.zeros_like(pixels))
-        if self.fault == "saturated":
-            return Image(np.full_like(pixels, 255))
-        if self.fault == "colour":
-            return Image(np.dstack([pixels] * 3))
-        if self.fault == "future stamp":
-            return Image(pixels, START_NS + 10**15)
-        if self.fault == "mirrored camera":
-            return Image(pixels[:, ::-1])
-        return shown
-
-    def offsets(self):
-        return self.machine.offsets()
-
-    def stop(self) -> None:
-        self.stops += 1
-
-    def close(self) -> None:
-        self.machine.close()
 
 
 def write_cell(folder, *, plan: str = PLAN, simulation: str = SIMULATION, cell: str = CELL,

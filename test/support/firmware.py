@@ -72,6 +72,35 @@ class Grbl(Firmware):
         return (f"<{state}|MPos:{self.at['X']:.3f},{self.at['Y']:.3f},0.000|FS:0,0>\r\n").encode()
 
 
+class FaultyGrbl(Grbl):
+    """Answers wrongly from a status report on; `reports` counts them."""
+
+    def __init__(self, fault: str, after: int) -> None:
+        super().__init__()
+        self.fault, self.after, self.reports = fault, after, 0
+
+    def byte(self, byte):
+        right = super().byte(byte)
+        self.reports += byte == b"?"
+        if byte != b"?" or self.reports < self.after:
+            return right
+        if self.fault == "garbage":
+            return right[:8] + bytes([0xf0, 0x9f, 0x07]) + right[12:]
+        if self.fault == "digits lost":
+            return right.replace(b".000,", b".0x0,")
+        if self.fault == "line cut":
+            return right[:16] + b"\r\n"
+        if self.fault == "reset":
+            self.at = dict.fromkeys(self.at, 0.0)
+            return self.greeting + right
+        if self.fault == "alarm":
+            return right.replace(b"Idle", b"Alarm:1").replace(b"Run", b"Alarm:1")
+        if self.fault == "never idle":
+            return right.replace(b"Idle", b"Run")
+        assert self.fault == "silent"
+        return b""
+
+
 class Marlin(Firmware):
     greeting = b"start\nMarlin 2.1.2\n"
     PER_MM = 80.0

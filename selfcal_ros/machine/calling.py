@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls of drivers and classes of others: whatever they raise becomes a `MachineError`."""
+
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from selfcal_ros.errors import SelfcalError, first_line
+from selfcal_ros.machine.interface import MachineError
+
+
+def called(where: str, function: Callable[..., Any], *values: Any,
+           remedy: str = "check cables, power and the driver", **more: Any) -> Any:
+    """Return what a function returns.
+
+    Parameters
+    ----------
+    where : str
+        What is called, for the error.
+    function : callable (*values, **more)
+        The driver's.
+    remedy : str
+        What a person can do if it fails.
+
+    Raises
+    ------
+    MachineError
+        For any error that is not one of this package, with the line of code that raised it.
+    """
+    try:
+        return function(*values, **more)
+    except (SelfcalError, ModuleNotFoundError):
+        raise
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        raise MachineError(f"{type(error).__name__}: {first_line(error)} "
+                           f"({Path(frame.filename).name}, line {frame.lineno})", where,
+                           remedy) from error
