@@ -48,8 +48,6 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
         self._camera: Camera | None = None
         spread = None
         if given.camera:
-            import scipy.ndimage  # noqa: F401  half a second, which would delay the first image
-
             self._camera, spread = camera_of(given.camera)
         self._spread = spread_of(asdict(given), spread)
         self._grain = np.random.default_rng((given.seed, IMAGES))

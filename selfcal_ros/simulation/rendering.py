@@ -7,6 +7,7 @@ each pixel; the detector's models are not used.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import groupby
 
 import numpy as np
@@ -159,8 +160,6 @@ class Camera:
 
     def _stamp(self, grey: np.ndarray, u: float, v: float, half: int, inside: "Distance",
                contrast: float, angle: float) -> None:
-        from scipy import ndimage  # half a second, which stage_simulator saves
-
         column, row = round(u), round(v)
         top, left = row - half, column - half
         rows = slice(max(top, 0), min(top + 2 * half + 1, self.height))
@@ -172,10 +171,29 @@ class Camera:
         a = -a if self.mirror else a
         cosine, sine = np.cos(angle), np.sin(angle)  # from columns to rows
         cover = np.clip(0.5 + FINE * inside(cosine * a + sine * b, cosine * b - sine * a), 0, 1)
-        cover = ndimage.gaussian_filter(cover, self.blur_px * FINE, truncate=5.0, mode="nearest")
-        pixels = cover.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean(axis=(1, 3))
+        along = blurred_pixels(2 * half + 1, self.blur_px)
+        pixels = along @ cover @ along.T
         grey[rows, columns] += contrast * pixels[
             rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
+
+
+@cache
+def blurred_pixels(count: int, blur_px: float) -> np.ndarray:
+    """Return the means over `count` pixels of a blurred line of `FINE` points each, as a matrix.
+
+    What lies beyond either end is as the last point there.
+
+    Returns
+    -------
+    float array (count, count * FINE)
+    """
+    sigma, n = blur_px * FINE, count * FINE
+    away = np.arange(-int(5 * sigma + 0.5), int(5 * sigma + 0.5) + 1)
+    weight = np.exp(-(away / max(sigma, np.finfo(float).tiny)) ** 2 / 2)
+    point, means = np.arange(n)[:, None], np.zeros((count, n))
+    np.add.at(means, (point // FINE, np.clip(point + away, 0, n - 1)),
+              weight / weight.sum() / FINE)
+    return means
 
 
 Distance = Callable[[np.ndarray, np.ndarray], np.ndarray]
