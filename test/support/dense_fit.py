@@ -66,8 +66,10 @@ class DenseFit:
         magnified = any(term == "microscope" for term, *_ in self.keys)
         self.places = places
         self.steps = PLACE_STEPS if places else STEPS if magnified or rigid else 1
-        for _ in range(self.steps):
+        for number in range(self.steps):
             self._columns = self._of_coefficients()
+            if number in (0, 1, self.steps - 1):  # between them the slopes hardly change
+                self._linearise()
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)
             self.offset = self.seen - self.left
@@ -218,20 +220,24 @@ class DenseFit:
         return np.array([(self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites))
                          / (2 * STEP) for h in unit]).T
 
-    def _step(self):
-        """Take a step to the least squares; keep unknowns, covariance and what is left."""
+    def _linearise(self):
+        """Keep the equations about the unknowns as they are, and the covariance."""
         p, sized = self.p, np.isfinite(self.size)
         self.design = self._root[:, None] * self._design(p)
-        rest = self._root * (self._values - self._predicted(p))
         prior = np.zeros((sized.sum(), len(p)))
         prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
         held = np.concatenate([self._datum(np.unique(self.site)), np.roll(
             self._datum(np.unique(self.mark))[:3], self.a.start - self.g.start, axis=1)])
         held = held / (EXACTLY * self.sigma[0])
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
-        known = np.concatenate([rest, -prior @ p, -held @ p])
-        self.p = p + solve[:, :len(known)] @ known
         self.covariance, self._solve = solve @ self._noise(solve.shape[1]) @ solve.T, solve
+        self._known = np.concatenate([prior, held])
+
+    def _step(self):
+        """Take a step to the least squares; keep unknowns and what is left."""
+        rest = self._root * (self._values - self._predicted(self.p))
+        known = np.concatenate([rest, -self._known @ self.p])
+        self.p = self.p + self._solve[:, :len(known)] @ known
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
 

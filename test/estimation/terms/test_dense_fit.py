@@ -82,11 +82,16 @@ def measured(plan, model, sense=Sense.MICROSCOPE_MOVES, missing=0.0, rotation="l
                                  settings=CellSettings(sense, 20e-9, 2e-6, **QUIET))
 
 
-def both(readings, model, **how):
+def solved(readings, model, **how):
     terms = parse_terms([MODELS[model]], "")
     result = calibrate(readings, Options(terms=terms, causes=False, uncertainty=True,
                                          drift_degree=DEGREE, **{"assumed": (), **how}))
     assert all(term.size_used is None for term in result.model.terms)  # none is contradicted
+    return result
+
+
+def both(readings, model, **how):
+    terms, result = parse_terms([MODELS[model]], ""), solved(readings, model, **how)
     noise = result.noise
     least = min(noise.sigma_xy_repeats, noise.sigma_xy_residuals)
     dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), degree=DEGREE,
@@ -186,7 +191,7 @@ def test_a_stage_that_stands_a_tenth_of_a_pitch_off_the_sites(model, sense):
     settings = CellSettings(sense, 20e-9, 2e-6, follow_mark=True, **QUIET)
     readings = simulate_measurements(truth, plan, rng, visits=True, settings=settings)
     result, dense = both(readings, "none", misalignment_model=model)
-    at_sites, _ = both(readings, "none", misalignment_model=model, at_places=False)
+    at_sites = solved(readings, "none", misalignment_model=model, at_places=False)
     dense.with_places_in_covariance()
     wanted, spread = dense.grid(np.isfinite(result.error_map.gx))
     (found, u), (other, u_other) = maps_of(result), maps_of(at_sites)
