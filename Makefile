@@ -7,7 +7,7 @@ QUICK := test/shipped/test_bags.py test/shipped/test_configs.py test/cli/test_mi
 	test/cli/test_arguments.py test/cli/test_solve.py test/cli/test_apply.py test/sessions test/reporting/test_html.py \
 	test/test_house.py test/test_portable.py
 
-.PHONY: help setup demo quick test test-313 test-oldest lint ament-lint mistakes bench soak chaos mutants reality \
+.PHONY: help setup demo quick test test-313 test-oldest lint ament-lint mistakes bench soak chaos power-cuts mutants reality \
 	pictures docs map3d reference sbom clean
 help:  ## this list
 	@awk -F ':.*  ## ' '/^[a-z0-9-]+:.*  ## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -64,6 +64,8 @@ soak: setup  ## a long live run, e.g. make soak HOURS=8 SIZE=21
 	@$(BIN)/python tools/soak.py --hours $(or $(HOURS),1) --size $(or $(SIZE),21)
 chaos: setup  ## nodes killed and messages lost at random, minutes, e.g. make chaos ROUNDS=3 SEED=7
 	@$(BIN)/python tools/chaos.py $(if $(ROUNDS),--rounds $(ROUNDS)) $(if $(SEED),--seed $(SEED))
+power-cuts: setup  ## a measurement killed at 20 points and resumed, minutes, e.g. make power-cuts CUTS=6 SEED=2
+	@$(BIN)/python tools/power_cuts.py $(if $(CUTS),--cuts $(CUTS)) $(if $(SEED),--seed $(SEED))
 mutants: setup  ## do the tests notice a flipped sign?, e.g. make mutants MUTANTS="--number 200 --only selfcal_ros/estimation"
 	@$(BIN)/python -m tools.mutants $(MUTANTS)
 reality: setup  ## coverage of U on machines unlike the model, minutes, e.g. make reality REALITY="--runs 10 --only drift"

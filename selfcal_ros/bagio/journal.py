@@ -19,6 +19,7 @@ from mcap.records import Channel, Schema
 
 from selfcal_ros import portable
 from selfcal_ros.bagio.journal_file import (
+    UNFINISHED,
     Content,
     JournalFile,
     finish_file,
@@ -184,6 +185,25 @@ def create(bag: Path) -> "Journal":
             with suppress(OSError):
                 bag.rmdir()
             raise
+
+
+def remove_unbegun(bag: Path) -> None:
+    """Remove a bag folder whose writer was killed before its first file was whole.
+
+    Raises
+    ------
+    InputError
+        If another process writes it.
+    """
+    lock = _locked(bag)
+    try:
+        files = list(bag.iterdir())
+        if all(path.suffix == UNFINISHED for path in files):
+            for path in files:
+                path.unlink()
+            bag.rmdir()
+    finally:
+        os.close(lock)
 
 
 class Journal(Closing):

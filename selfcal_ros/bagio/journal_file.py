@@ -105,13 +105,17 @@ def ending(content: Content) -> bytes:
     return data_end + summary + footer + MAGIC
 
 
+UNFINISHED = ".part"
+"""Suffix of a file whose beginning is not on the disk yet."""
+
+
 class JournalFile:
     """Append records to a new file; a failed write is undone."""
 
     def __init__(self, path: Path) -> None:
         self.content = Content(FileEntry(path.name), end=0)
         self._torn = False  # whether there is data after the last complete record
-        part = path.with_suffix(".part")  # so that a file of a journal is never empty
+        part = path.with_suffix(UNFINISHED)  # so that a file of a journal is never empty
         self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
                            | os.O_CLOEXEC, 0o666)
         try:

@@ -32,6 +32,8 @@ SHIPPED = {
     "micromanager": "selfcal_ros.machine.micromanager:MicroManagerMachine",
 }
 """Machines of this package; further ones are entry points of the group ``selfcal.machines``."""
+FOLDER = "folder"
+"""Key of a machine that gets the folder of CELL.yaml unless the file gives it."""
 DEFAULT_STEP_M = 1e-4
 """First move where the size of the marks is not known."""
 PLACERS = ("person", "robot")
@@ -241,8 +243,8 @@ def open_machine(cell: Cell) -> Machine:
     kind = class_of(cell)
     check_keys(kind, cell)
     keys = dict(cell.keys)
-    if "folder" in inspect.signature(kind).parameters and "folder" not in keys:
-        keys["folder"] = str(cell.path.parent)
+    if FOLDER in inspect.signature(kind).parameters and FOLDER not in keys:
+        keys[FOLDER] = str(cell.path.parent)
     machine = called(f"{cell.path}: {cell.machine}", kind, **keys)
     for name in ("axes", "position", "move_to", "image", "offsets", "stop", "close"):
         if not hasattr(machine, name):
@@ -313,7 +315,7 @@ def check_keys(kind: Any, cell: Cell) -> None:
     if not takes_any:
         _only(cell.keys, parameters, where)
     missing = [name for name, item in parameters.items()
-               if item.default is item.empty and name not in cell.keys]
+               if item.default is item.empty and name not in {*cell.keys, FOLDER}]
     if missing:
         raise InputError(where, f"the key '{missing[0]}' is missing",
                          f"give {cell.name}: {{{missing[0]}: ...}}")

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from selfcal_ros.bagio.journal import Claim, Journal, create
+from selfcal_ros.bagio.journal import Claim, Journal, create, remove_unbegun
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import cdr_bytes
@@ -176,6 +176,8 @@ class Run:
 
     def _begin(self, resume: bool) -> list[Command]:
         """Open the bag; return the commands to begin with."""
+        if resume and self.bag.is_dir():
+            remove_unbegun(self.bag)
         if not self.bag.exists():
             self._journal = create(self.bag)
             self._declare()

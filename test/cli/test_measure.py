@@ -3,10 +3,7 @@
 
 import io
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ import pytest
 
 from selfcal_ros.cli.main import main
 from test.support.cells import CELL, PLAN, write_cell
+from test.support.power_cuts import Cut, detections, measured, outcome, prepare
 
 LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 
@@ -38,39 +36,23 @@ def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, caps
 
 
 def test_a_run_that_is_killed_is_resumed_to_the_same_map(tmp_path):
-    """Killed after several exposures, over and over; each time the same command continues."""
-    write_cell(tmp_path, plan=LINES)
-    kill = tmp_path / "sitecustomize.py"
-    kill.write_text(
-        "import os, signal\n"
-        "from selfcal_ros.machine import simulated\n"
-        "image = simulated.SimulatedMachine.offsets\n"
-        "n = [0]\n"
-        "def offsets(self):\n"
-        "    n[0] += 1\n"
-        "    if n[0] == int(os.environ['KILLED_AT']):\n"
-        "        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "    return image(self)\n"
-        "simulated.SimulatedMachine.offsets = offsets\n")
-    run = [sys.executable, "-c", f"exec(open({str(kill)!r}).read()); import sys; "
-           "from selfcal_ros.cli.main import main; sys.exit(main(sys.argv[1:]))",
-           "measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]
-    codes = []
-    for killed_at in [20, 33, 35, 40, 10**9]:
-        done = subprocess.run(run, cwd=tmp_path, env=os.environ | {"KILLED_AT": str(killed_at)},
-                              check=False, capture_output=True, text=True)
-        codes.append(done.returncode)
-    assert codes[:4] == [-signal.SIGKILL] * 4, done.stderr
-    assert codes[4] == 0, done.stderr
-    result = json.loads((tmp_path / "bag.json").read_text())
-    assert result["verdict"]["qualified"]
-    assert main(["measure", str(tmp_path / "plan.yaml"), str(tmp_path / "cell.yaml"), "-o",
-                 str(tmp_path / "whole"), "--yes"]) == 0
-    whole = json.loads((tmp_path / "whole.json").read_text())
-    for axis in ("gx", "gy"):
-        away = np.subtract(result["error_map"][axis], whole["error_map"][axis])
-        u = np.hypot(result["error_map"][f"u_{axis}"], whole["error_map"][f"u_{axis}"])
-        assert np.abs(away).max() < 4 * u.max()
+    """Killed in a move, with half of a message written, and before its first file is whole."""
+    whole = tmp_path / "whole"
+    prepare(whole)
+    assert measured(whole).returncode == 0
+    for number, cut in enumerate([
+            Cut("in a move", 70), Cut("half of a message written", 300),
+            Cut("before a file is on the disk", 1)]):
+        folder = tmp_path / str(number)
+        prepare(folder)
+        assert measured(folder, cut).returncode == -signal.SIGKILL
+        kept = detections(folder)
+        assert bool(kept) is (cut.number > 1)
+        resumed = measured(folder)
+        assert resumed.returncode == 0, resumed.stderr
+        found = outcome(folder, whole, kept)
+        assert (found.lost, found.doubled, found.qualified) == (0, 0, True)
+        assert found.away < 4
 
 
 @pytest.mark.parametrize(("words", "cell", "said"), [
