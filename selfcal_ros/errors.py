@@ -99,6 +99,17 @@ def known_are(word: str, known: Iterable[str]) -> str:
     return f"{hint} known are {', '.join(names)}".strip()
 
 
+def mend_of(value: object, kind: type) -> str:
+    """Return the remedy for a value that is not of the type `kind`."""
+    if kind is list:
+        return f"write [{value}]" if isinstance(value, str) else "give a list"
+    if not isinstance(value, str) or kind not in (int, float):
+        return "correct the value"
+    if re.fullmatch(r"[-+\d]*,\d+([eE][-+]?\d+)?", value.strip()):
+        return f"write {value.replace(',', '.')}, with a decimal point"
+    return "give a number in SI units, without a unit and without quotes"
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of another library's error text, or its type if it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]

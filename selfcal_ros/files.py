@@ -23,7 +23,7 @@ from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
-from selfcal_ros.errors import InputError, first_line, known_are
+from selfcal_ros.errors import InputError, first_line, known_are, mend_of
 from selfcal_ros.outputs import write_text
 from selfcal_ros.portable import AT_ONCE
 
@@ -353,7 +353,7 @@ def checked_fields(data: object, where: str, required: dict,
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
-                             "correct the value")
+                             mend_of(value, kind))
         out[key] = value
     return out
 

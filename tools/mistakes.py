@@ -45,13 +45,23 @@ PLANS = {
     "huge": PLAN.replace("grid_size: 5", "grid_size: 4001"),
     "negative": PLAN.replace("grid_pitch: 0.01", "grid_pitch: -0.01"),
     "half": PLAN.replace("[1, 0]", "[1]"),
+    "um": PLAN.replace("0.01", "10000"),
+    "quoted": PLAN.replace("0.01", "'0,01'"),
+    "unit": PLAN.replace("0.01", "10mm"),
+    "term": PLAN + "model_terms: drift\n",
+    "twice": PLAN + "views: []\n",
     "list": "- a\n- b\n",
     "empty": ""}
 """Name of a plan -> its text, each with one mistake."""
 TABLES = {
     "semicolons": "x;y\n0;0\n", "decimal": "x;y\n0,01;0,02\n", "mm": "x,y\n10,20\n30,40\n",
     "headless": "0,0\n0.01,0\n", "other": "east,north\n0,0\n", "text": "x,y\n0,left\n",
-    "short": "x,y\n0\n", "none": "", "nan": "x,y\n0,nan\n"}
+    "short": "x,y\n0\n", "none": "", "nan": "x,y\n0,nan\n", "degrees": "x,y,theta\n0,0,45\n"}
+CELLS = {
+    "machine": "machine: simulatd\nsimulatd: {}\n", "limits_mm":
+    "machine: simulated\nlimits: {x: [-60, 60], y: [-60, 60]}\n", "falling":
+    "machine: simulated\nlimits: {x: [0.1, -0.1], y: [-0.1, 0.1]}\n"}
+"""Name of a CELL.yaml -> its text, each with one mistake."""
 
 
 class Mistake(NamedTuple):
@@ -83,6 +93,9 @@ MISTAKES = [Mistake(*row) for row in (
     ("report", 2, "RESULT.json is missing"),
     ("plan check config/plans/hu.yaml --sigma 20furlong", 2, "20furlong"),
     ("plan check config/plans/hu.yaml --sigma -5nm", 2, "sigma"),
+    ("plan check config/plans/hu.yaml --sigma 20", 2, "'20' is 20 m, .* one of m, mm, um, nm"),
+    ("plan check config/plans/hu.yaml --placing 90", 2, "'90' is 90 rad, .* one of rad, .*deg"),
+    ("detect bags/camera -o marks --pixel-size 6um", 2, "'6um' is not a number; .* a unit"),
     ("plan check config/plans/hu.yaml --repeats 0", 2, "--repeats: 0 is not positive"),
     ("plan check config/plans/hu.yaml --repeats many", 2, "'many'"),
     # files that are not there, or of another kind
@@ -94,6 +107,10 @@ MISTAKES = [Mistake(*row) for row in (
     ("solve cut.mcap", 2, "cut.mcap"),
     ("solve bags/demo -o no/where/r.json", 2, "name an existing, writable folder"),
     ("solve bags/demo -o R.json", 2, "the file exists; name another file, or .* --force"),
+    ("solve bags/demo -o result.csv", 2, "RESULT.json is written .* end the name in .json"),
+    ("cal export R.json -o s.txt", 2, "end the name in .cal"),
+    ("report newer.json", 2, "not a result of schema selfcal.result/1"),
+    ("gcode none.nc R.json -o o.nc --dialect grbl", 2, "the file is empty"),
     ("solve bags/demo -o bags", 2, "bags: it is a folder; name a file"),
     ("report no.json", 2, "no.json: no such file; check the path"),
     ("report bags/demo", 2, "a map is computed from it with `selfcal solve bags/demo"),
@@ -122,6 +139,12 @@ MISTAKES = [Mistake(*row) for row in (
     ("recheck bags/demo R.json", 2, "swapped; write `selfcal recheck R.json bags/demo`"),
     ("gcode R.json part.nc -o o.nc --dialect linuxcnc", 2, "swapped; write `selfcal gcode part"),
     ("cal verify stage.cal R.json", 2, "swapped; write `selfcal cal verify R.json stage.cal`"),
+    ("measure config/cells/simulated.yaml mine.yaml -o m", 2,
+     "swapped; write `selfcal measure mine.yaml config/cells/simulated.yaml -o m`"),
+    ("cell try mine.yaml", 2, "is a plan, and a cell is needed here"),
+    ("measure mine.yaml machine.cell.yaml -o m --yes", 2, "did you mean 'simulated'"),
+    ("measure mine.yaml limits_mm.cell.yaml -o m --yes", 2, "limits: x: .* is it in mm"),
+    ("measure mine.yaml falling.cell.yaml -o m --yes", 2, "two rising numbers"),
     ("export R.json siemens -o t.ini --unit mm", 2, "'R.json' is a file, and "),
     ("certificate config/certificates/details.yaml R.json -o c.xml", 2, "details.yaml"),
     # plans
@@ -134,7 +157,9 @@ MISTAKES = [Mistake(*row) for row in (
         ("turn_rad", 2, "is it in rad.*give 90"),
         ("comma", 2, "comma.yaml"), ("zero", 2, "repeats.*0"), ("tiny", 2, "grid_size.*2"),
         ("huge", 2, "grid_size.*4001|401"), ("negative", 2, "grid_pitch.*-0.01"),
-        ("half", 2, "translation_pitch"),
+        ("half", 2, "translation_pitch"), ("um", 2, "is it in um"),
+        ("quoted", 2, "write 0.01, with a decimal point"), ("unit", 2, "without a unit"),
+        ("term", 2, r"write \[drift\]"), ("twice", 2, "'views' is given twice"),
         ("list", 2, "list.yaml"), ("empty", 2, "empty.yaml"), ("no", 2, "no such file"))),
     # measurements that do not determine the stage, images, other faults of a recording
     ("solve bags/deficient", 3, r"shifted by \+1 pitch along X"),
@@ -150,7 +175,8 @@ MISTAKES = [Mistake(*row) for row in (
     *((f"apply R.json {name}.csv -o o.csv", 2, says) for name, says in (
         ("semicolons", "semicolons"), ("decimal", "semicolons"), ("mm", "is it in mm"),
         ("headless", "headless.csv:1"), ("other", "other.csv:1.*x"), ("text", "text.csv:2"),
-        ("short", "short.csv:2"), ("none", "none.csv"), ("nan", "nan.csv:2"))),
+        ("short", "short.csv:2"), ("none", "none.csv"), ("nan", "nan.csv:2"),
+        ("degrees", "is it in degrees"))),
     ("apply R.json no.csv -o o.csv", 2, "no.csv: no such file"),
     # controllers
     ("export heidenhain R.json -o t.txt --unit mm", 2, "'heidenhain' is unknown; known are "),
@@ -160,6 +186,7 @@ MISTAKES = [Mistake(*row) for row in (
     ("cal export R.json -o s.cal --x-axis X", 2, "--x-axis: .*'X'"),
     ("cal eval stage.cal --position 1", 2, "--position"),
     ("cal eval stage.cal --position 1=ten", 2, "'ten'"),
+    ("cal eval stage.cal --position 1=10,5", 2, "'10,5' is not a number; .* 1=10.5"),
     ("cal check R.json", 2, "is a result, and a calibration file is needed here"),
     ("cal check no.cal", 2, "no.cal: no such file"),
     ("gcode part.nc R.json -o o.nc", 2, "dialect"),
@@ -196,11 +223,16 @@ def _furnish(folder: Path) -> None:
     _run(["cal", "export", "R.json", "-o", "stage.cal"])
     for plan, text in PLANS.items():
         (folder / f"{plan}.yaml").write_text(text)
+    for cell, text in CELLS.items():
+        (folder / f"{cell}.cell.yaml").write_text(text)
     for table, text in TABLES.items():
         (folder / f"{table}.csv").write_text(text)
     (folder / "points.csv").write_text("x,y\n0,0\n")
+    (folder / "none.nc").touch()
     (folder / "part.nc").write_text("G21 G90\nG0 X0 Y0\n")
     (folder / "cut.json").write_text((folder / "R.json").read_text()[:LEFT_OF_FILE])
+    (folder / "newer.json").write_text((folder / "R.json").read_text().replace(
+        "selfcal.result/1", "selfcal.result/2", 1))
     bag = next((ROOT / "bags/demo").glob("*.mcap")).read_bytes()
     (folder / "cut.mcap").write_bytes(bag[:6])
     (folder / "mine.yaml").write_text(PLAN)

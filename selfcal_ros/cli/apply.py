@@ -133,6 +133,9 @@ def read_points(text: str, where: str) -> np.ndarray:
                              f"give {','.join(head)} in m and rad")
     if not len(points):
         raise InputError(where, "it has no points", "give at least one")
+    if "theta" in head and (largest := np.abs(points[:, 2]).max()) > 2 * np.pi:
+        raise InputError(where, f"theta up to {largest:g} rad, more than a turn: is it in degrees?",
+                         "give theta in rad, within a turn")
     return points
 
 

@@ -17,21 +17,27 @@ OUTPUTS = {"--output", "--report", "--plot", "--theta-output", "--cal", "--save-
 """Options that name a file to write."""
 FOLDERS = ("BAG", "FOLDER", "DIR")
 """Names of outputs that are folders: they are never replaced."""
+FORMATS = {".json": (), ".yaml": (".yml",), ".cal": ()}
+"""Ending of a file to write, as in the name of its argument -> others that it may have."""
+OTHERS = (".csv", ".html", ".pdf", ".png", ".svg", ".txt", ".mcap", ".xml", *FORMATS)
+"""Endings that say of a file that it is of another kind."""
 SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
 
 BAG, RESULT, PLAN, SIMULATION = "a bag", "a result", "a plan", "a simulation"
 PARAMETERS, CAL, TABLE, PROGRAM = ("a parameter file of nodes", "a calibration file",
                                    "a table of numbers", "a G-code program")
+CELL = "a cell"
 WANTED = {"BAG": BAG, "A.json": RESULT, "B.json": RESULT, "RESULT.json": RESULT,
-          "PLAN.yaml": PLAN, "SIM.yaml": SIMULATION, "NODES.yaml": PARAMETERS, "FILE.cal": CAL,
-          "ACTIVE.cal": CAL, "POINTS.csv": TABLE, "MAP.csv": TABLE, "DATA.csv": TABLE,
-          "IN": PROGRAM}
+          "PLAN.yaml": PLAN, "CELL.yaml": CELL, "SIM.yaml": SIMULATION,
+          "NODES.yaml": PARAMETERS, "FILE.cal": CAL, "ACTIVE.cal": CAL, "POINTS.csv": TABLE,
+          "MAP.csv": TABLE, "DATA.csv": TABLE, "IN": PROGRAM}
 """Name of an argument -> kind of file that it stands for."""
 USES = {BAG: "a map is computed from it with `selfcal solve {} -o RESULT.json`",
         RESULT: "`selfcal report {}` shows it",
         PLAN: "`selfcal plan check {}` says what it determines",
         SIMULATION: "`selfcal simulate {} -o BAG` writes its bag",
+        CELL: "`selfcal cell try {}` shows what its machine sees",
         PARAMETERS: "give it with --params",
         CAL: "`selfcal cal check {}` reads it",
         TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points",
@@ -43,6 +49,7 @@ BEGINNINGS = (
     (CAL, re.compile(rb"(?:.*\n)*?:(?:START|GALVO2D)")),
     (PARAMETERS, re.compile(rb"(?:.*\n)*?\s+ros__parameters\s*:")),
     (PLAN, re.compile(rb"(?:.*\n)*?plan_id\s*:")),
+    (CELL, re.compile(rb"(?:.*\n)*?machine\s*:\s*[\w.]")),
     (SIMULATION, re.compile(rb"(?:.*\n)*?(?:plan|truth|noise)\s*:")))
 ENDINGS = {".csv": TABLE, ".nc": PROGRAM, ".ngc": PROGRAM, ".gcode": PROGRAM}
 
@@ -82,14 +89,23 @@ def check_existing(args: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        If the file of an output exists.
+        If the file of an output exists, or its name is that of another kind of file.
     """
     inputs = {os.path.realpath(item.path) for item in _files(args)}
     for action in _outputs(args.leaf):
         name = getattr(args, action.dest)
         place = os.path.realpath(name or "")
         if name and place not in inputs and os.path.dirname(place) not in inputs:
+            _refuse_ending(name, str(action.metavar))
             refuse_existing(name, force=args.force)
+
+
+def _refuse_ending(path: str, metavar: str) -> None:
+    """Raise InputError if the name of an output ends as that of a file of another kind."""
+    wanted, ending = (os.path.splitext(name)[1].lower() for name in (metavar, path))
+    if wanted in FORMATS and ending in OTHERS and ending not in (wanted, *FORMATS[wanted]):
+        raise InputError(path, f"{metavar} is written here, which is not {ending}",
+                         f"end the name in {wanted}")
 
 
 def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:

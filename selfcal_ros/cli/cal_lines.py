@@ -60,7 +60,7 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
             value = math.nan
         if not value >= (SMALLEST if positive else -math.inf):
             raise InputError(option, f"'{text}' is not a {'positive ' * positive}number",
-                             f"write {option} {axis}=1000")
+                             f"write {option} {axis}={1000 if positive else 10.5}")
         found[axis] = value
     return found
 

@@ -56,7 +56,10 @@ def run(args: argparse.Namespace) -> int:
         wanted(result.error_map, Wiring(frame)), dialect=args.dialect,
         tolerance_m=args.tolerance * M_PER_UM, step_m=plate.grid_pitch_m / 32, unit=unit,
         decimals=args.decimals)
-    program = corrected_program(read_text(args.program), args.program, rewriter)
+    text = read_text(args.program)
+    if not text.strip():
+        raise InputError(args.program, "the file is empty", "name a G-code program")
+    program = corrected_program(text, args.program, rewriter)
     (x0, *_, x1), (y0, *_, y1) = nodes(result.error_map, frame)
     lowest, highest = rewriter.reach_m
     said = ["moves leave the field, beyond which the correction at its edge is used, without U"]

@@ -9,6 +9,7 @@ another one (`selfcal_ros.cli.verbs`). It is imported when it is asked for, so t
 import argparse
 import importlib
 import os
+import re
 import shutil
 import signal
 import sys
@@ -31,6 +32,9 @@ from selfcal_ros.cli.verbs import (
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, did_you_mean, printable
 from selfcal_ros.portable import hold_interrupts
 
+NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
+NUMBERS = {"float": "a number; give it without a unit, with a decimal point",
+           "int": "a whole number"}
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
@@ -201,6 +205,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with one line and exit code 2."""
+        wrong = NOT_A_NUMBER.fullmatch(message)
+        if wrong:
+            message = f"{wrong[1]}: {wrong[3]} is not {NUMBERS[wrong[2]]}"
         required = "the following arguments are required: "
         if message.startswith(required):
             names = message.removeprefix(required).replace("/--", " or --")

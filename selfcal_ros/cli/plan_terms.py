@@ -31,6 +31,8 @@ SIGMA_THETA = "3.6arcsec"
 STOP_ERROR = "100nm"
 STAGE_ERROR = "1um"
 PLACING = "0.3deg"
+MOST_M, MOST_RAD = 1e-3, 0.1
+"""Largest standard deviations: 20 without a unit is meant in another one."""
 NO_TERMS = "none"
 
 
@@ -62,18 +64,19 @@ def add_term_options(parser: argparse.ArgumentParser) -> None:
                         f"(default {SIGMA_THETA})")
 
 
-def length_m(text: str, option: str) -> float:
+def length_m(text: str, option: str, most: float = math.inf) -> float:
     """Return a length such as ``20e-9`` or ``20nm`` in m.
 
     Raises
     ------
     InputError
-        If it is not a positive length.
+        If it is not a positive length, or above `most`.
     """
-    return _quantity(text, option, M_PER, "length")
+    return _quantity(text, option, M_PER, "length", most)
 
 
-def _quantity(text: str, option: str, units: Mapping[str, float], what: str) -> float:
+def _quantity(text: str, option: str, units: Mapping[str, float], what: str,
+              most: float) -> float:
     """Return a positive number with one of the units, the first if none is given."""
     found = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
     plain = next(iter(units))
@@ -85,6 +88,9 @@ def _quantity(text: str, option: str, units: Mapping[str, float], what: str) -> 
     if not 0 < value < math.inf:
         raise InputError(option, f"'{text}' is not a positive {what}",
                          f"give {plain}, or a number and one of " + ", ".join(units))
+    if value > most:
+        raise InputError(option, f"'{text}' is {value:g} {plain}, and at most {most:g} {plain} is "
+                         "possible here", "give a number and one of " + ", ".join(units))
     return value
 
 
@@ -101,11 +107,11 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
         raise InputError("--drift-degree", f"{degree} is not a degree of a drift",
                          f"give 1 to {MAX_DRIFT_DEGREE}")
     order = str(parse_order(args.order, "--order")) if args.order else ""
-    return Assumed(length_m(args.sigma or SIGMA, "--sigma"),
-                   length_m(args.stop_error, "--stop-error"), degree, order,
-                   _quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle"),
-                   _quantity(args.placing, "--placing", RAD_PER, "angle"),
-                   length_m(args.stage_error, "--stage-error"))
+    return Assumed(length_m(args.sigma or SIGMA, "--sigma", MOST_M),
+                   length_m(args.stop_error, "--stop-error", MOST_M), degree, order,
+                   _quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD),
+                   _quantity(args.placing, "--placing", RAD_PER, "angle", MOST_RAD),
+                   length_m(args.stage_error, "--stage-error", MOST_M))
 
 
 def sizes_of(args: argparse.Namespace) -> dict[str, float]:

@@ -67,8 +67,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="replace an existing FILE.cal; the old one is kept with its date")
     add_frame(parser, theta=False)
     add_bag_options(parser)
-    parser.add_argument("-o", "--output", metavar="OUT.json",
-                        help="file for the result; default: print it")
+    parser.add_argument("-o", "--output", metavar="OUT.json|.csv",
+                        help="file for the result, or the readings; default: print it")
     add_json(parser, "the result, even if it is written to a file")
 
 

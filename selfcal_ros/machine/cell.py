@@ -15,7 +15,7 @@ from typing import Any, cast
 
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.parameter import Parameter
-from selfcal_ros.errors import InputError, did_you_mean, first_line, known_are
+from selfcal_ros.errors import InputError, first_line, known_are
 from selfcal_ros.files import read_text, read_yaml
 from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Machine, MachineError
@@ -36,6 +36,8 @@ FOLDER = "folder"
 """Key of a machine that gets the folder of CELL.yaml unless the file gives it."""
 DEFAULT_STEP_M = 1e-4
 """First move where the size of the marks is not known."""
+LONGEST_M = 20.0
+"""Limits beyond are in another unit."""
 PLACERS = ("person", "robot")
 NOT_OF_A_CELL = ("autostart", "hardware_id", "transport", "max_waiting", "frame_id")
 """Parameters of the node mark_detector that a cell does not have."""
@@ -162,12 +164,20 @@ def read_cell(path: str | Path) -> Cell:
                          f"{', '.join(known_machines())}, or package.module:Class")
     machine = data["machine"]
     own = machine.rpartition(":")[2]
+    if ":" not in machine and machine not in known_machines():
+        raise InputError(f"{where}: machine", f"there is no machine '{machine}'",
+                         f"{known_are(machine, sorted(known_machines()))}; or "
+                         "package.module:Class")
     known = ("machine", own, "limits", "origin", "sense", "settle", "detector", "placing", "found")
     _only(data, known, where)
     limits = {}
     for axis, pair in _mapping(data.get("limits", {}), f"{where}: limits").items():
         limits[axis] = _pair(pair, f"{where}: limits: {axis}")
     _only(limits, AXES, f"{where}: limits")
+    for axis in AXES[:2]:
+        if max(map(abs, limits.get(axis, (0.0,)))) > LONGEST_M:
+            raise InputError(f"{where}: limits: {axis}", f"{limits[axis]} m: is it in mm?",
+                             "give m")
     for axis in ("x", "y"):
         if axis not in limits:
             raise InputError(f"{where}: limits", f"the travel of {axis} is not limited",
@@ -275,14 +285,8 @@ def connected(cell: Cell, say: Callable[[str], None]) -> Iterator[Machine]:
 
 def class_of(cell: Cell) -> Any:
     """Return the class of a cell's machine; raises InputError like `open_machine`."""
-    named = known_machines()
-    target = cell.machine if ":" in cell.machine else named.get(cell.machine, "")
+    target = cell.machine if ":" in cell.machine else known_machines()[cell.machine]
     where = f"{cell.path}: machine"
-    if not target:
-        hint = did_you_mean(cell.machine, named)
-        raise InputError(where, f"there is no machine '{cell.machine}'",
-                         f"{hint} known are {', '.join(sorted(named))}; or package.module:Class"
-                         .strip())
     module, _, name = target.partition(":")
     folder = str(cell.path.resolve().parent)
     if folder not in sys.path:

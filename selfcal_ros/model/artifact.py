@@ -10,6 +10,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.marks import MarkList
+from selfcal_ros.units import MM_PER_M
 
 MAX_GRID_SIZE = 401
 MAX_ANGULAR_COUNT = 1_000_000
@@ -115,7 +116,8 @@ class Artifact:
         if not PITCH_RANGE_M[0] <= self.grid_pitch_m <= PITCH_RANGE_M[1]:
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is no pitch of a "
                              f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
-                             "is it in mm? give the distance between marks in metres")
+                             f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'um'}? "
+                             "give the distance between marks in metres")
         if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:
             raise InputError("artifact angular_count", f"{self.angular_count} is not a number from "
                              f"3 to {MAX_ANGULAR_COUNT}", "give 0 for a plate without lines")

@@ -260,7 +260,7 @@ def test_terms_of_a_plan_are_read_and_checked():
              "rotation, yaw"),
             ([{"drift": 1e-9}], "here: model_terms: {'drift': 1e-09} is not a text; write TERM or "
              "TERM:SIZE"),
-            ("drift", "here: model_terms: 'drift' is not of type list; correct the value")):
+            ("drift", "here: model_terms: 'drift' is not of type list; write [drift]")):
         with pytest.raises(InputError) as caught:
             plan_from_dict(plan_with(model_terms=terms), "here")
         assert str(caught.value) == message

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Self
 
-from selfcal_ros.errors import InputError, known_are
+from selfcal_ros.errors import InputError, known_are, mend_of
 
 BARE_Y = "y"
 """ROS reads a bare y in a parameter file as true, and `ros2 param dump` writes it bare."""
@@ -41,7 +41,7 @@ class Parameter:
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
-                             "put it in quotes" if kind is str else "correct the value")
+                             "put it in quotes" if kind is str else mend_of(value, kind))
         if kind is list and not all(isinstance(item, str) for item in value):
             raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of strings",
                              "put each item in quotes")
