@@ -108,7 +108,6 @@ MISTAKES = [Mistake(*row) for row in (
     ("solve bags/demo -o no/where/r.json", 2, "name an existing, writable folder"),
     ("solve bags/demo -o R.json", 2, "the file exists; name another file, or .* --force"),
     ("solve bags/demo -o result.csv", 2, "RESULT.json is written .* end the name in .json"),
-    ("cal export R.json -o s.txt", 2, "end the name in .cal"),
     ("report newer.json", 2, "not a result of schema selfcal.result/1"),
     ("gcode none.nc R.json -o o.nc --dialect grbl", 2, "the file is empty"),
     ("solve bags/demo -o bags", 2, "bags: it is a folder; name a file"),

@@ -17,9 +17,9 @@ OUTPUTS = {"--output", "--report", "--plot", "--theta-output", "--cal", "--save-
 """Options that name a file to write."""
 FOLDERS = ("BAG", "FOLDER", "DIR")
 """Names of outputs that are folders: they are never replaced."""
-FORMATS = {".json": (), ".yaml": (".yml",), ".cal": ()}
+FORMATS = {".json": (), ".yaml": (".yml",)}
 """Ending of a file to write, as in the name of its argument -> others that it may have."""
-OTHERS = (".csv", ".html", ".pdf", ".png", ".svg", ".txt", ".mcap", ".xml", *FORMATS)
+OTHERS = (".csv", ".html", ".pdf", ".png", ".svg", ".txt", ".mcap", ".xml", ".cal", *FORMATS)
 """Endings that say of a file that it is of another kind."""
 SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
@@ -49,7 +49,7 @@ BEGINNINGS = (
     (CAL, re.compile(rb"(?:.*\n)*?:(?:START|GALVO2D)")),
     (PARAMETERS, re.compile(rb"(?:.*\n)*?\s+ros__parameters\s*:")),
     (PLAN, re.compile(rb"(?:.*\n)*?plan_id\s*:")),
-    (CELL, re.compile(rb"(?:.*\n)*?machine\s*:\s*[\w.]")),
+    (CELL, re.compile(rb"(?:.*\n)*?limits[ \t]*:")),
     (SIMULATION, re.compile(rb"(?:.*\n)*?(?:plan|truth|noise)\s*:")))
 ENDINGS = {".csv": TABLE, ".nc": PROGRAM, ".ngc": PROGRAM, ".gcode": PROGRAM}
 
