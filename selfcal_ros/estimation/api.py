@@ -32,7 +32,7 @@ from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import KnownPlate, known_plate
+from selfcal_ros.estimation.recheck.plate import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.artifact import Artifact

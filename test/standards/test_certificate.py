@@ -20,7 +20,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
 from selfcal_ros.estimation.options import Options, ReferenceLength
-from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact

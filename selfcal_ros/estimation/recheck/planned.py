@@ -8,7 +8,8 @@ import numpy as np
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.observability.prediction import Prediction
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import KnownPlate, map_change
+from selfcal_ros.estimation.recheck.change import map_change
+from selfcal_ros.estimation.recheck.plate import KnownPlate
 from selfcal_ros.estimation.recheck.solve import Rechecked, recheck_of
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements, ViewReadings

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.checks.placing import (
     on_marks,
     said,
 )
-from selfcal_ros.estimation.recheck.change import KnownPlate, rows_at
+from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings

@@ -32,15 +32,8 @@ from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import (
-    KnownPlate,
-    NewLines,
-    NewMap,
-    line_change,
-    map_change,
-    on_plate,
-    record,
-)
+from selfcal_ros.estimation.recheck.change import NewLines, NewMap, line_change, map_change, record
+from selfcal_ros.estimation.recheck.plate import KnownPlate, on_plate
 from selfcal_ros.estimation.recheck.same_plate import check_plate
 from selfcal_ros.estimation.recheck.views import (
     Gain,

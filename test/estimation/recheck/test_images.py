@@ -14,8 +14,8 @@ from selfcal_ros.estimation.comparison.together import together
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.planned import predict_recheck
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense

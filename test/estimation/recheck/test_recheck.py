@@ -19,8 +19,8 @@ from selfcal_ros.estimation.comparison.covariance import (
 )
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
-from selfcal_ros.estimation.recheck.change import known_plate
 from selfcal_ros.estimation.recheck.planned import predict_recheck
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import _misfit, recheck
 from selfcal_ros.estimation.recheck.views import Gain, Seen
 from selfcal_ros.model.artifact import Artifact

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.recheck import same_plate
-from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense

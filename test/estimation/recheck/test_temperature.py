@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.estimation.recheck.change import known_plate
+from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
