@@ -19,7 +19,7 @@ from selfcal_ros.estimation.observability.plan_check import check_plan, predict_
 from selfcal_ros.estimation.observability.rank import best_turn_deg
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import prediction_errors
-from selfcal_ros.estimation.recheck.views import line_gain
+from selfcal_ros.estimation.recheck.views import line_rows
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -300,11 +300,11 @@ def test_a_recheck_of_a_known_plate_finds_the_series():
     of = rng.normal(size=2 * harmonics + 1) * [0, *[1] * 6]
     line = np.flatnonzero(weight[0])
     y = fourier_basis((line + 3.3) * math.tau / count, harmonics) @ of + 0.7
-    gain = line_gain(turns, weight, np.eye(len(line)), harmonics)
+    rows = line_rows(turns, weight, np.eye(len(line)), harmonics)
     lines = np.arange(count) * math.tau / count
-    np.testing.assert_allclose(gain.rows @ y, fourier_basis(lines, harmonics) @ of, atol=1e-12)
+    np.testing.assert_allclose(rows @ y, fourier_basis(lines, harmonics) @ of, atol=1e-12)
     weight[0, :4] = 0  # 4 lines for 7 numbers
-    assert not line_gain(turns, weight, np.eye(4), harmonics).rows.any()
+    assert not line_rows(turns, weight, np.eye(4), harmonics).any()
 
 
 def test_the_picture_follows_the_series_between_the_lines():

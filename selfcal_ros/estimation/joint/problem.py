@@ -12,9 +12,9 @@ from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.places import StagePlaces
+from selfcal_ros.estimation.terms.places import StagePlaces, places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, between_visits
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
@@ -393,6 +393,32 @@ def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
         together = np.equal.outer(grid.rotations, grid.rotations)
         moment, turned = together @ moment, together @ turned
     return turned / np.where(moment > 0, moment, 1.0)
+
+
+def problem_of(measurements: Measurements, options: Options, system: NormalEquations,
+               ground: TermInputs, *, readings: tuple[GridData, AngularData],
+               conditions: Conditions, terms: tuple[ModelTerm, ...], known: np.ndarray,
+               images: ImageNoise | None = None) -> Problem:
+    """Return the problem that readings pose, in the frame of the plate as it lies.
+
+    Parameters
+    ----------
+    measurements, options
+        The readings and how they are solved.
+    system, ground, readings
+        What is made of the readings.
+    conditions, terms, images
+        As in `Problem`.
+    known : bool array (nx, ny)
+        Sites whose error is known.
+    """
+    rigid = options.finite_rotations
+    problem = Problem(
+        system, *readings, *repeats_of(measurements), ground.half_width_m, conditions, ground,
+        options.reference, rigid, terms, turn_rad=np.zeros(len(readings[0].index)),
+        places=places_of(measurements, readings[0], ground, known),
+        at_places=options.at_places, images=images)
+    return turned(problem) if rigid else problem
 
 
 def turned(problem: Problem) -> Problem:

@@ -31,7 +31,7 @@ from selfcal_ros.estimation.joint.noise_effects import (
     image_variances,
     structured,
 )
-from selfcal_ros.estimation.joint.problem import Problem, repeats_of, turned
+from selfcal_ros.estimation.joint.problem import Problem, problem_of
 from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
 from selfcal_ros.estimation.joint.solved import (
     MICROSCOPE_PARTS,
@@ -51,7 +51,6 @@ from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
-from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.sizes import require_terms_told
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
@@ -135,22 +134,17 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
     ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
-    rigid = options.finite_rotations
     terms = tuple(
         term for term in options.model_terms(
-            visits=all(v is not None for v in ground.visits), assumed=rigid)
+            visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations)
         if ground.has(term.name))
-    problem = Problem(
-        system, grid, angular, *repeats_of(measurements), half_width_m, conditions, ground,
-        options.reference, rigid, terms,
-        places=places_of(measurements, grid, ground, system.known_sites),
-        at_places=options.at_places,
-        images=image_noise(
-            measurements.artifact, [v.view for v in measurements.views], system,
-            ground.yaw if any(term.block.of_images for term in terms) else None,
-        ) if measurements.has_images else None)
-    return turned(problem) if problem.rigid else replace(
-        problem, turn_rad=np.zeros(len(grid.index))), seen
+    images = image_noise(
+        measurements.artifact, [v.view for v in measurements.views], system,
+        ground.yaw if any(term.block.of_images for term in terms) else None,
+    ) if measurements.has_images else None
+    return problem_of(measurements, options, system, ground, readings=(grid, angular),
+                      conditions=conditions, terms=terms, known=system.known_sites,
+                      images=images), seen
 
 
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,

@@ -22,83 +22,9 @@ from selfcal_ros.estimation.comparison.maps import (
 )
 from selfcal_ros.estimation.recheck.detection import ChangeTests
 from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
-from selfcal_ros.estimation.recheck.views import Gain
+from selfcal_ros.estimation.recheck.views import NewMap
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
-
-
-@dataclass(frozen=True, eq=False)
-class NewMap:
-    """A map from a known plate, stage frame, its scale relative to the plate.
-
-    Attributes
-    ----------
-    artifact : Artifact
-        Its nodes.
-    known : bool array (nx, ny)
-        Which of them are known.
-    xy : float array (2, nx, ny)
-        The map, no translation and rotation, m.
-    gain : Gain
-        Of the map (2 nx ny), from the readings; its noise without that of the plate, m^2.
-    white : float array (2 r,)
-        Variance of the noise of each reading by itself, m^2.
-    images : float array (2 r, 2 stops)
-        The readings for the noise of each image, m.
-    plate : float array (r, 2 m + 4)
-        The readings for a unit of Ax, Ay at each known mark, and of the microscope.
-    marks : bool array (mx, my)
-        Known marks.
-    dof : float
-        Degrees of freedom of the noise of the readings.
-    """
-
-    artifact: Artifact
-    known: np.ndarray
-    xy: np.ndarray
-    gain: Gain
-    white: np.ndarray
-    images: np.ndarray
-    plate: np.ndarray
-    marks: np.ndarray
-    dof: float
-
-    def variances(self, plate: KnownPlate) -> dict[str, np.ndarray]:
-        """Return the variances of the map by their sources, (2 n,), m^2.
-
-        Without scale unless a reference length sets it.
-        """
-        nowhere = np.zeros(plate.kept.sites.shape, dtype=bool)
-        rows = self.gain.rows
-        if plate.reference is None:
-            rows = self.without_scale(rows)
-        moved = rows @ self.plate
-        of_plate = np.einsum("ij,ij->i", moved @ plate.kept.cover(nowhere, self.marks), moved)
-        of_noise = np.einsum("ij,j,ij->i", rows, self.white, rows)
-        of_noise += ((rows @ self.images)**2).sum(axis=1)
-        whole = np.einsum("ij,ij->i", rows @ self.gain.noise, rows)
-        of_length = plate.variance_of_length * (moved @ plate.length_at(self.marks))**2
-        return {"reading noise": of_noise, "known plate": np.maximum(of_plate, 0.0),
-                "plate temperature": of_length, "terms": np.maximum(whole - of_noise, 0.0)}
-
-    def covariance(self, plate: KnownPlate) -> np.ndarray:
-        """Return the covariance of the map at the known nodes, Gx, then Gy, m^2, as `variances`."""
-        nowhere, rows = np.zeros(plate.kept.sites.shape, dtype=bool), self.gain.rows
-        if plate.reference is None:
-            rows = self.without_scale(rows)
-        rows = rows[np.tile(self.known.ravel(), 2)]
-        moved = rows @ self.plate
-        by_length = moved @ plate.length_at(self.marks)
-        return rows @ self.gain.noise @ rows.T + moved @ plate.kept.cover(
-            nowhere, self.marks) @ moved.T + plate.variance_of_length * np.outer(
-            by_length, by_length)
-
-    def without_scale(self, values: np.ndarray) -> np.ndarray:
-        """Return maps (2 n, ...) without motion and magnification over the known nodes."""
-        here, out = np.tile(self.known.ravel(), 2), np.zeros(values.shape)
-        q = np.linalg.qr(datum_modes(self.artifact, scale=True).reshape(4, -1).T[here])[0]
-        out[here] = values[here] - q @ (q.T @ values[here])
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,47 +61,83 @@ class Change:
         return tuple(map(int, np.unravel_index(np.nanargmax(ratio), ratio.shape)))
 
 
-def map_change(new: NewMap, plate: KnownPlate) -> Change:
-    """Return the change of the XY map since the calibration of the plate.
+def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
+    """Return the change of the XY map, of nodes `artifact`, since the calibration of the plate.
 
     Raises
     ------
     InputError
         If less than three nodes are known in both maps.
     """
-    old = plate.result.error_map
-    rows, sites, there = _on_nodes(new.artifact, plate)
-    common = new.known & there
-    if common.sum() < 3:
-        raise InputError(plate.where, f"only {int(common.sum())} nodes are known in both maps",
+    old, (rows, sites, there) = plate.result.error_map, _on_nodes(artifact, plate)
+    common = new.known & np.tile(there.ravel(), 2)
+    if common.sum() < 6:
+        raise InputError(plate.where, f"only {common.sum() // 2} nodes are known in both maps",
                          "measure where its map is known")
-    here, w = np.tile(common.ravel(), 2), rows[common.ravel()]
-    both = np.kron(np.eye(2), w)
-    values = new.xy.reshape(-1)[here] - both @ np.concatenate([old.gx[sites], old.gy[sites]])
-    gain = new.gain.rows[here]
-    moved = -np.hstack([both, gain @ new.plate])
-    of_old = moved @ plate.kept.cover(sites, new.marks) @ moved.T
-    by_expansion = gain @ new.plate @ plate.length_at(new.marks)
-    of_new = gain @ new.gain.noise @ gain.T
-    of_old += plate.variance_of_expansion * np.outer(by_expansion, by_expansion)
+    values, of_new, of_old = _difference(new, common, np.kron(np.eye(2), rows), np.concatenate(
+        [old.gx[sites], old.gy[sites]]))
+    by_expansion = new.from_length[common[new.known]]
+    of_old = of_old + plate.variance_of_expansion * np.outer(by_expansion, by_expansion)
     dof = joint_dof((np.trace(of_new), new.dof), (np.trace(of_old), plate.result.noise.dof_xy))
-    modes = datum_modes(new.artifact, scale=True).reshape(4, -1).T[here]
+    covariance = of_new + of_old
+
+    modes = datum_modes(artifact, scale=True).reshape(4, -1).T[common]
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
-    cover = of_new + of_old
-    z = (new.artifact.x_m + 1j * new.artifact.y_m)[common]
-    tests = ChangeTests(z, cover, basis, dof)
-    rest = tests.without(values)
-    test = significance(rest, [(cover, True)], basis, dof)
-    part = scale_row(modes)
-    scale, u_scale = float(part @ values), float(np.sqrt(part @ cover @ part))
-    out = np.full((2, 2 * new.known.size), np.nan)
-    out[:, here] = rest, _u_without(cover, basis)
-    shape = (2, *new.known.shape)
-    return Change(out[0].reshape(shape), out[1].reshape(shape), test,
-                  1.0 if test is None else tests.p(rest), scale, u_scale,
+    z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[:artifact.m.size]]
+    tests = ChangeTests(z, covariance, basis, dof)
+    in_datum = tests.without(values)
+    test = significance(in_datum, [(covariance, True)], basis, dof)
+    row = scale_row(modes)
+    scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
+
+    out = np.full((2, len(common)), np.nan)
+    out[:, common] = in_datum, _u_without(covariance, basis)
+    changes, u = out.reshape(2, 2, *artifact.shape)
+    return Change(changes, u, test, 1.0 if test is None else tests.p(in_datum), scale, u_scale,
                   2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
                   None if test is None else tests)
+
+
+def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray,
+                old: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return new minus old map where both are known, and the covariances of its two sources.
+
+    Those of the noise of the new readings, and of the calibration: what it got wrong is in the old
+    map and, by the plate, in the new one.
+
+    Parameters
+    ----------
+    new : NewMap
+        The new map.
+    common : bool array (n,)
+        Where both are known.
+    rows : float array (n, j)
+        The old map there for a unit of each of its known values.
+    old : float array (j,)
+        These.
+    """
+    here, rows = common[new.known], rows[common]
+    by_calibration = -np.hstack([rows, new.from_plate[here]])
+    return (new.values[here] - rows @ old, new.of_noise[np.ix_(here, here)],
+            by_calibration @ new.before @ by_calibration.T)
+
+
+def line_change(new: NewMap, plate: KnownPlate) -> Change:
+    """Return the change of the angular map since the calibration of the plate."""
+    old, count = plate.result.error_map.g_theta, len(new.known)
+    common = plate.kept.lines()[0][0] & new.known
+    out = np.full((2, count), np.nan)
+    if common.sum() < 2:
+        return Change(out[0], out[1], None)
+    values, of_new, of_old = _difference(new, common, np.eye(count), np.nan_to_num(old))
+    dof = joint_dof((np.trace(of_new), new.dof),
+                    (np.trace(of_old), plate.result.noise.dof_theta))
+    constant = np.ones((len(values), 1))
+    values = values - values.mean()
+    out[:, common] = values, _u_without(of_new + of_old, constant)
+    test = significance(values, [(of_new + of_old, True)], constant, dof)
+    return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
 def scale_row(modes: np.ndarray) -> np.ndarray:
@@ -200,53 +162,6 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
         return np.eye(kept.size)[:, kept.ravel()], kept, kept
     rows, kept, inside = rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
     return rows, kept, inside.reshape(artifact.shape)
-
-
-@dataclass(frozen=True, eq=False)
-class NewLines:
-    """An angular map from a known plate, stage frame.
-
-    Attributes
-    ----------
-    values : float array (K,)
-        The map, rad, its mean 0; NaN where unknown.
-    gain : Gain
-        Of the map from the readings; its noise without that of the plate, rad^2.
-    plate : float array (r, K)
-        The readings for a unit of Atheta at each line.
-    dof : float
-        Degrees of freedom of the noise of the readings.
-    """
-
-    values: np.ndarray
-    gain: Gain
-    plate: np.ndarray
-    dof: float
-
-    def covariance(self, plate: KnownPlate) -> np.ndarray:
-        """Return the covariance of the map, (K, K), rad^2."""
-        count, moved = len(self.values), self.gain.rows @ self.plate
-        return self.gain.covariance + moved @ plate.kept.lines()[1][count:, count:] @ moved.T
-
-
-def line_change(new: NewLines, plate: KnownPlate) -> Change:
-    """Return the change of the angular map since the calibration of the plate."""
-    (known, _), cover = plate.kept.lines()
-    old, count = plate.result.error_map.g_theta, len(new.values)
-    here = known & np.isfinite(new.values)
-    out = np.full((2, count), np.nan)
-    if here.sum() < 2:
-        return Change(out[0], out[1], None)
-    values, rows = (new.values - old)[here], new.gain.rows[here]
-    moved = -np.hstack([np.eye(count)[here], rows @ new.plate])
-    of_new, of_old = rows @ new.gain.noise @ rows.T, moved @ cover @ moved.T
-    dof = joint_dof((np.trace(of_new), new.dof),
-                    (np.trace(of_old), plate.result.noise.dof_theta))
-    basis = np.ones((len(values), 1))
-    values = values - values.mean()
-    out[:, here] = values, _u_without(of_new + of_old, basis)
-    test = significance(values, [(of_new + of_old, True)], basis, dof)
-    return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
 def record(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate) -> dict[str, Any]:

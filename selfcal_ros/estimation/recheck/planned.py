@@ -50,7 +50,7 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     emap = found.error_map(plate)
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
     return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
-                          rms(map_change(found.new, plate).u) / unit)
+                          rms(map_change(found.new, found.artifact, plate).u) / unit)
 
 
 def _planned(view: View, plan: Plan) -> ViewReadings:

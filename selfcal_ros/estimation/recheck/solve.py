@@ -18,37 +18,37 @@ from selfcal_ros.estimation.joint.problem import (
     MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
-    Problem,
     coverage_factor,
     noise_estimate,
-    repeats_of,
-    turned,
+    problem_of,
 )
 from selfcal_ros.estimation.joint.solve import views_of
 from selfcal_ros.estimation.joint.solved import noise_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
-from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import NewLines, NewMap, line_change, map_change, record
+from selfcal_ros.estimation.recheck.change import line_change, map_change, record
 from selfcal_ros.estimation.recheck.plate import KnownPlate, on_plate
 from selfcal_ros.estimation.recheck.same_plate import check_plate
 from selfcal_ros.estimation.recheck.views import (
-    Gain,
+    NOISE,
+    TERMS,
+    NewMap,
     PlateReadings,
-    Seen,
-    line_gain,
-    seen_field,
+    PlateSolution,
+    ReadingNoise,
+    line_rows,
+    plate_solution,
     stacked,
 )
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
-from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, rms
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm
@@ -73,35 +73,42 @@ class Rechecked:
     ----------
     readings : PlateReadings
         The readings.
-    new, lines : NewMap, NewLines
-        Both maps, stage frame.
-    seen : Seen
+    solution : PlateSolution
         The solution of the marks, frame of the equations.
+    new, lines : NewMap
+        Both maps.
     xy, theta : NoiseEstimate
         Noise of one reading of each kind.
     """
 
     readings: PlateReadings
+    solution: PlateSolution
     new: NewMap
-    lines: NewLines
-    seen: Seen
+    lines: NewMap
     xy: NoiseEstimate
     theta: NoiseEstimate
 
+    @property
+    def artifact(self) -> Artifact:
+        """Nodes of the map."""
+        return self.readings.measurements.artifact.field
+
+    def in_datum(self, plate: KnownPlate) -> NewMap:
+        """Return the XY map, without scale unless a reference length sets it."""
+        if plate.reference is not None:
+            return self.new
+        return self.new.without(datum_modes(self.artifact, scale=True).reshape(4, -1).T)
+
     def error_map(self, plate: KnownPlate) -> ErrorMap:
-        """Return the map with its uncertainty, without scale unless a reference length sets it."""
-        new, artifact, known = self.new, self.new.artifact, self.new.known
-        xy = new.xy if plate.reference else new.without_scale(
-            new.xy.reshape(-1)).reshape(new.xy.shape)
-        variance = np.sum(list(new.variances(plate).values()), axis=0).reshape(xy.shape)
-        (gx, gy), (u_x, u_y) = (np.where(known, values, np.nan)
-                                for values in (xy, np.sqrt(variance)))
+        """Return the map with its uncertainty."""
+        artifact, xy = self.artifact, self.in_datum(plate)
+        variance = np.sum(list(xy.variances(plate.variance_of_length).values()), axis=0)
+        (gx, gy), (u_x, u_y) = (xy.whole(part).reshape(2, *artifact.shape)
+                                for part in (xy.values, np.sqrt(variance)))
+        u_theta = np.sqrt(np.diag(self.lines.covariance(0.0)))
+        theta, u_theta = (self.lines.whole(part) for part in (self.lines.values, u_theta))
         o, r = first_order(artifact, gx + 1j * gy)
-        theta = self.lines.values
-        u_theta = np.where(np.isfinite(theta), np.sqrt(np.diag(self.lines.covariance(plate))),
-                           np.nan)
-        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r,
-                        ThetaDatum.ZERO_MEAN)
+        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN)
 
 
 def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
@@ -111,8 +118,8 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
                          "length of the plate's calibration", "leave both out")
     readings = plate_readings(on_plate(measurements, plate), options, plate)
     xy, theta = _noise(readings, plate)
-    new, seen = _new_map(readings, plate, xy, options)
-    return Rechecked(readings, new, _new_lines(readings, plate, theta), seen, xy, theta)
+    new, solution = _new_map(readings, plate, xy, options)
+    return Rechecked(readings, solution, new, _new_lines(readings, plate, theta), xy, theta)
 
 
 @one_thread()
@@ -135,35 +142,34 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
-    readings, seen, new, lines = solved.readings, solved.seen, solved.new, solved.lines
-    known = np.tile(new.known.ravel(), 2)
-    parts = {name: variance[known] for name, variance in new.variances(plate).items()}
-    of_lines = np.isfinite(lines.values)
-    covers = {"xy": new.covariance(plate),
-              "theta": lines.covariance(plate)[np.ix_(of_lines, of_lines)]}
-    found = record(map_change(new, plate), line_change(lines, plate), new.artifact, plate)
+    readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
+    xy = solved.in_datum(plate)
+    parts = xy.variances(plate.variance_of_length)
+    covers = {"xy": xy.covariance(plate.variance_of_length), "theta": solved.lines.covariance(0.0)}
+    change = map_change(solved.new, solved.artifact, plate)
+    found = record(change, line_change(solved.lines, plate), solved.artifact, plate)
+    found["passes"] = min(view.view.repeats for view in measurements.views)
     noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
-        seen, dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
-    found["passes"] = min(view.view.repeats for view in measurements.views)
-    before, problem = plate.result.verdict, readings.problem
-    unknowns = 2 * int(seen.known.sum()) + problem.system.grid.n_misalignments
+        solution.square, solution.dof,
+        dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
+    unknowns = 2 * int(solution.known.sum()) + problem.system.grid.n_misalignments
     declared = {term.name for term in options.terms}
     terms = tuple(TermResult(
         str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
         for term in problem.terms)
-    of_views = np.pad(seen.parameters, (0, problem.system.size - len(seen.parameters)),
-                      constant_values=np.nan)
+    parameters = np.full(problem.system.size, np.nan)
+    parameters[:len(solution.parameters)] = solution.parameters
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
-        views_of(measurements, problem, of_views), Observability(unknowns, unknowns, 0, True),
+        views_of(measurements, problem, parameters), Observability(unknowns, unknowns, 0, True),
         noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
         sense=str(measurements.sense), extra={KEY: found, **kept_covariance(covers)},
         run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
-                        enlarged_by=before.enlarged_by),
+                        enlarged_by=plate.result.verdict.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
         reference=plate.reference, provenance=provenance_of(measurements, options),
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
@@ -191,21 +197,12 @@ def plate_readings(measurements: Measurements, options: Options,
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
     artifact, system = measurements.artifact, system_for(grid, angular)
-    views, length = system.grid.views, artifact.grid_pitch_m * max(artifact.reach)
+    length = artifact.grid_pitch_m * max(artifact.reach)
     ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
-    lines, shape = artifact.angular_count, views.z_sites.shape
-    nothing = Conditions(ThetaDatum.ZERO_MEAN, np.zeros((0, lines)), np.zeros((0, *shape)),
-                         np.zeros((lines, 0)), np.zeros((len(angular.index), 0)))
-    read = np.zeros(views.z_sites.size, dtype=bool)
-    read[views.site_index[grid.weight > 0]] = True
-    problem = Problem(
-        system, grid, angular, *repeats_of(measurements), length, nothing, ground,
-        rigid=options.finite_rotations, terms=terms,
-        places=places_of(measurements, grid, ground, read.reshape(shape) if isinstance(
-            views, LatticeViews) else np.ones(shape, dtype=bool)),
-        at_places=options.at_places, turn_rad=np.zeros(len(grid.index)))
-    problem = turned(problem) if problem.rigid else problem
+    read = system.grid.components.of_site.reshape(system.grid.views.shape) >= 0
+    problem = problem_of(measurements, options, system, ground, readings=(grid, angular),
+                         conditions=Conditions.none(system), terms=terms, known=read)
     quiet = without_noise(problem.ground, np.zeros(grid.y.shape))
     cells = cells_seen(artifact, [measurements.views[index].view for index in grid.index])
     if cells is not None and (count := np.count_nonzero(grid.weight)) > MOST_OF_IMAGES:
@@ -250,79 +247,80 @@ def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, N
 
 
 def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
-             options: Options) -> tuple[NewMap, Seen]:
+             options: Options) -> tuple[NewMap, PlateSolution]:
     """Return the map of the stage, stage frame, and as it was solved."""
-    values, size = readings.of_terms()
-    terms, (mark, image) = stacked(values) * size, _two_noises(readings, plate, xy)
-    white, images = np.tile(mark / readings.weight, 2), np.sqrt(image) * readings.of_images()
-    noise = np.diag(white) + images @ images.T + terms @ terms.T
-    matrix, size = readings.of_offsets()
-    found = plate.of_offsets
-    if found is None or any(term.block.of_offsets for term in options.terms):
-        own, found = stacked(matrix) * size, np.zeros(4)
-        noise, matrix = noise + own @ own.T, 0 * matrix
-    marks, of_marks = readings.of_marks()
-    of_plate = np.hstack([of_marks, stacked(matrix)])
-    nowhere = np.zeros(plate.kept.sites.shape, dtype=bool)
-    whole = noise + of_plate @ plate.kept.cover(nowhere, marks) @ of_plate.T
-    seen = seen_field(readings, whole, plate.field[readings.at[1:]], matrix @ found)
-    n, field, known = seen.known.size, seen.field, seen.known
-    rows = seen.gain.rows[:2 * n].reshape(2, *known.shape, -1)
+    microscope, declared = plate.microscope, any(term.block.of_offsets for term in options.terms)
+    calibrated = microscope is not None and not declared
+    terms = readings.of_terms(lambda block: not block.of_lines
+                              and not (calibrated and block.of_offsets))
+    of_microscope = readings.of_microscope() * calibrated
+    of_plate = np.hstack([readings.of_marks(), stacked(of_microscope)])
+    noise = _noise_of_marks(readings, plate, xy.sigma, stacked(terms))
+    sites, marks = plate.kept.sites, readings.marks
+    before = plate.kept.cover(sites, marks)
+    of_marks = before[2 * sites.sum():, 2 * sites.sum():]
+    solution = plate_solution(
+        readings, noise.covariance + of_plate @ of_marks @ of_plate.T,
+        plate.field[readings.at[1:]], of_microscope @ (microscope if calibrated else np.zeros(4)))
+
+    field, known = solution.field, solution.known
+    rows = solution.rows[:2 * known.size].reshape(2, *known.shape, -1)
     if readings.measurements.sense is Sense.PLATE_MOVES:  # G(X) = -H(-X)
         field, known, rows = -field[::-1, ::-1], known[::-1, ::-1], -rows[:, ::-1, ::-1]
-    return NewMap(readings.measurements.artifact.field, known, np.stack([field.real, field.imag]),
-                  Gain(rows.reshape(2 * n, -1), noise), white, images, of_plate, marks,
-                  xy.dof), seen
+    both = np.tile(known.ravel(), 2)
+    return NewMap(both, stacked(field.ravel())[both], rows.reshape(len(both), -1)[both], noise,
+                  of_plate, before, xy.dof, of_plate @ plate.length_at(marks)), solution
 
 
-def _two_noises(readings: PlateReadings, plate: KnownPlate,
-                xy: NoiseEstimate) -> tuple[float, float]:
-    """Return the variances of the noise of a mark, and of that which an image's marks share, m^2.
+def _noise_of_marks(readings: PlateReadings, plate: KnownPlate, sigma: float,
+                    terms: np.ndarray) -> ReadingNoise:
+    """Return the noise of the marks: of each mark, of what the marks of an image share, of terms.
 
-    That of a mark is the calibration's, and not none: the readings have to be weighted.
+    That of a mark in images is the calibration's, and not none: the readings have to be weighted.
     """
-    if not len(readings.stop):
-        return xy.sigma**2, 0.0
-    mark = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
-    mark = float(np.clip(mark, LEAST_PART * xy.sigma**2, xy.sigma**2))
-    return mark, xy.sigma**2 - mark
+    of_mark = sigma**2
+    if len(readings.stop):
+        of_mark = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
+        of_mark = float(np.clip(of_mark, LEAST_PART * sigma**2, sigma**2))
+    return ReadingNoise(np.tile(of_mark / readings.weight, 2), {
+        NOISE: np.sqrt(sigma**2 - of_mark) * readings.of_images(), TERMS: terms})
 
 
-def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewLines:
+def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
     angular, count = readings.problem.angular, readings.measurements.artifact.angular_count
-    known = plate.kept.lines()[0][1]
+    (_, known), before = plate.kept.lines()
     weight = np.where(known, angular.weight, 0.0)
     view, line = np.nonzero(weight)
-    if not len(view):
-        return NewLines(np.full(count, np.nan), Gain(np.zeros((count, 0)), np.zeros((0, 0))),
-                        np.zeros((0, count)), theta.dof)
-    own = np.zeros((len(view), count))
-    own[np.arange(len(view)), line] = 1.0
-    columns, noise = readings.columns, np.diag(theta.sigma**2 / weight[view, line])
-    for at, values in zip(columns.lines.at, columns.lines.values, strict=True):
-        here = columns.size[at] * values[view, line]
-        noise += np.outer(here, here)
-    whole = noise + plate.kept.lines()[1][count:, count:][np.ix_(line, line)]
-    gain = line_gain(angular.turns, weight, whole, angular.harmonics)
-    found = gain.rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
-    found[~gain.rows.any(axis=1)] = np.nan
-    rows = gain.rows
+    of_plate = (line[:, None] == np.arange(count)).astype(float)
+    columns = readings.columns
+    terms = columns.size[columns.lines.at] * columns.lines.values[:, view, line].T if len(
+        columns.lines.at) else np.zeros((len(view), 0))
+    noise = ReadingNoise(theta.sigma**2 / weight[view, line], {TERMS: terms})
+    rows = np.zeros((count, len(view)))
+    if len(view):
+        whole = noise.covariance + before[count:, count:][np.ix_(line, line)]
+        rows = line_rows(angular.turns, weight, whole, angular.harmonics)
+    values = rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
     if readings.measurements.sense is Sense.PLATE_MOVES:
-        back = -np.arange(count) % count
-        found, rows = -found[back], -rows[back]
-    return NewLines(found, Gain(rows, noise), own, theta.dof)
+        back = -np.arange(count) % max(count, 1)
+        values, rows = -values[back], -rows[back]
+    told = rows.any(axis=1)
+    return NewMap(told, values[told], rows[told], noise, of_plate, before, theta.dof)
 
 
-def _misfit(seen: Seen, dof_noise: float) -> tuple[Finding, ...]:
-    """Return whether the residuals are larger than noise and plate allow, if there are any."""
-    dof = seen.dof
+def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
+    """Return whether the residuals are larger than noise and plate allow, if there are any.
+
+    Their sum of squares in units of their covariance, and their degrees of freedom.
+    """
     if dof <= 0:
         return ()
-    square = float(seen.rest @ np.linalg.solve(seen.gain.noise, seen.rest))
     p = float(chdtrc(dof, square) if dof_noise >= MANY_DOF else fdtrc(dof, dof_noise, square / dof))
-    more = float(np.sqrt(square / dof))
-    return (Finding("plate_misfit", more, unit="m/m", p=p),) if p < F_LEVEL and more > SAME else ()
+    ratio = float(np.sqrt(square / dof))
+    if not (p < F_LEVEL and ratio > SAME):
+        return ()
+    return (Finding("plate_misfit", ratio, unit="m/m", p=p),)
 
 
 def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:

@@ -22,7 +22,6 @@ from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.planned import predict_recheck
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import _misfit, recheck
-from selfcal_ros.estimation.recheck.views import Gain, Seen
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset
@@ -46,13 +45,9 @@ MODELS = {"none": "", "microscope": "microscope:0.01:0.01:0.002"}
 
 @pytest.mark.parametrize(("dof_noise", "p"), [(1e9, chi2.sf(100, 1)), (9, f.sf(100, 1, 9))])
 def test_one_degree_of_freedom_can_contradict_the_plate(dof_noise, p):
-    nothing = np.zeros((1, 1))
-    seen = Seen(nothing > 0, nothing, np.zeros(3), Gain(nothing, 4 * np.eye(2)),
-                np.array([12.0, 16.0]), 1)
-    (finding,) = _misfit(seen, dof_noise)
+    (finding,) = _misfit(100.0, 1, dof_noise)
     assert (finding.name, finding.size, finding.p) == ("plate_misfit", 10, pytest.approx(p))
-    assert _misfit(replace(seen, rest=np.array([3.0, 0.0])), dof_noise) == ()
-    assert _misfit(replace(seen, dof=0), dof_noise) == ()
+    assert _misfit(2.0, 1, dof_noise) == _misfit(100.0, 0, dof_noise) == ()
 
 
 @pytest.fixture(autouse=True)
@@ -149,9 +144,9 @@ def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(model, pose
                  rel=1e-5 if model == "none" else 1e-2)
 
 
-def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic"):
+def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic", nodes=5):
     """Readings of six general views, and of one more of a changed stage."""
-    rng, artifact = np.random.default_rng(seed), placed.plate(7, 5, how)
+    rng, artifact = np.random.default_rng(seed), placed.plate(7, nodes, how)
     before, truth = placed.readings(artifact, placed.SIX, rng, linear=True, sigma=sigma)
     field = truth.field + change * rng.normal(size=truth.field.shape)
 
@@ -168,12 +163,13 @@ def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic"):
         view, dx=view.dx + moved.real, dy=view.dy + moved.imag),))
 
 
-@pytest.mark.parametrize("pose", [(0, (0, 0)), (4, (0.1, -0.1)), (90, (0.5, 0.5))])
-def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose):
-    before, after = general(pose, change=3e-8)
+@pytest.mark.parametrize(("pose", "nodes"), [
+    ((0, (0, 0)), 5), ((4, (0.1, -0.1)), 5), ((90, (0.5, 0.5)), 5), ((4, (0.1, -0.1)), 3)])
+def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose, nodes):
+    before, after = general(pose, change=3e-8, nodes=nodes)
     first = saved(calibrate(before, linear()))
     result = recheck(after, linear(), known_plate(first, "r.json"))
-    assert result.error_map.valid.sum() >= 15
+    assert result.error_map.valid.sum() > nodes**2 / 2
     assert result.verdict.qualified
     require_same(result, TwoSessions(before, after, before.artifact, first.noise.sigma_xy,
                                      known=result.error_map.valid), rel=1e-4)
