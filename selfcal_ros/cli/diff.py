@@ -14,12 +14,12 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.maps import (
     LaserDifference,
     MapDifference,
-    Significance,
     compare,
     compare_with_laser,
 )
 from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.files import read_json
+from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.figures.maps import difference_picture

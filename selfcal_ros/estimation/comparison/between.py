@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.comparison.maps import Significance, significance, without
+from selfcal_ros.estimation.comparison.maps import significance, without
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.recheck import Significance
 
 INDEPENDENT = 1e-6
 """Part of a unit shape outside the span of earlier ones, below which it adds nothing."""

@@ -17,7 +17,6 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
 from selfcal_ros.estimation.comparison.maps import (
-    Significance,
     joint_dof,
     require_same_lattice,
     significance,
@@ -25,6 +24,7 @@ from selfcal_ros.estimation.comparison.maps import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.error_map import datum_modes, rms
+from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 
 REMAINS_LEVEL = 0.0005

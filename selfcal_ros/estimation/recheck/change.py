@@ -15,7 +15,6 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
     PITCH_TOLERANCE,
-    Significance,
     joint_dof,
     significance,
     without,
@@ -25,6 +24,7 @@ from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
 from selfcal_ros.estimation.recheck.views import NewMap
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
+from selfcal_ros.model.recheck import Significance
 
 
 @dataclass(frozen=True, eq=False)
