@@ -18,6 +18,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, ClassVar, Literal, cast, get_args, get_origin, get_type_hints
 
+import numpy as np
 import yaml
 from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
@@ -362,7 +363,7 @@ _hints = cache(get_type_hints)
 
 
 def read(kind: Any, value: Any) -> Any:
-    """Return a value from JSON as `kind`: a dataclass, a tuple of one kind, or a plain type.
+    """Return a value from JSON as `kind`: a dataclass, a tuple, an array, or a plain type.
 
     Null is NaN for a float. Keys that a dataclass has no field for are ignored.
 
@@ -381,6 +382,8 @@ def read(kind: Any, value: Any) -> Any:
         return tuple(read(inner[0], item) for item in read(list, value))
     if get_origin(kind) is UnionType:  # of a kind and None
         return None if value is None else read(inner[0], value)
+    if kind is np.ndarray:  # null is NaN here as well
+        return np.array(read(list, value), dtype=float)
     if kind is float:
         if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise ValueError(f"{value!r} is not a number")

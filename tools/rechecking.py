@@ -136,7 +136,7 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
     good = np.isfinite(u)
     inside = float(np.mean(np.abs(error[good]) < result.noise.k_xy * u[good]))
     return (before.verdict.qualified and result.verdict.qualified,
-            bool(result.extra["recheck"]["changed"]), inside,
+            bool(result.recheck.changed), inside,
             float(np.sqrt(np.mean((error[good] / u[good]) ** 2))))
 
 

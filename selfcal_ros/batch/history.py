@@ -45,8 +45,9 @@ class Entry:
     @property
     def kind(self) -> str:
         """``calibration``, ``recheck`` or ``mean``."""
-        extra = self.result.extra
-        return "recheck" if "recheck" in extra else "mean" if "combined" in extra else "calibration"
+        if self.result.recheck is not None:
+            return "recheck"
+        return "mean" if "combined" in self.result.extra else "calibration"
 
     @property
     def expanded_m(self) -> float:

@@ -255,8 +255,8 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
 
 def _since(result: Any) -> list[str]:
     """Return the text of the change since the calibration of a known plate."""
-    found = result.extra.get("recheck")
-    return [] if found is None else ["", f"change since {found['of']}:", *(
+    found = result.recheck
+    return [] if found is None else ["", f"change since {found.of}:", *(
         f"  {line}" for line in recheck_lines(found))]
 
 

@@ -24,6 +24,7 @@ from selfcal_ros.model.plate_form import (
     map_to_dict,
 )
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.verdict import (
     BudgetLine,
     Finding,
@@ -176,6 +177,7 @@ class Noise:
 class CalibrationResult:
     """The result of a calibration.
 
+    `recheck` is what views of a known plate show to have changed; None of a calibration.
     `excluded` are effects outside the model, with what they would add to u at a nominal size.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the
@@ -203,6 +205,7 @@ class CalibrationResult:
     budget: tuple[BudgetLine, ...] = ()
     excluded: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
+    recheck: Recheck | None = None
     read_from: tuple[str, str] | None = None
 
     @property
@@ -313,6 +316,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "budget": plain([line_to_dict(line) for line in result.budget]),
         "excluded": plain([line_to_dict(line) for line in result.excluded]),
         "input": dict(result.input),
+        **({} if result.recheck is None else {"recheck": result.recheck.to_dict()}),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -370,7 +374,7 @@ _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "excluded", "input", "map", DIGEST}
+          "budget", "excluded", "input", "map", "recheck", DIGEST}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -426,7 +430,8 @@ def _parse(data: dict) -> CalibrationResult:
         findings_from_list(Finding, data.get("findings", [])),
         budget_from_list(data.get("budget", [])),
         budget_from_list(data.get("excluded", [])),
-        artifact if artifact.map_grid else None)
+        artifact if artifact.map_grid else None,
+        read(Recheck | None, data.get("recheck")))
 
 
 def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:

@@ -8,7 +8,6 @@ from typing import Any
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.units import UM_PER_M
@@ -88,23 +87,23 @@ def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]
 
 def method_name(result: CalibrationResult) -> str:
     """Return the name of the method."""
-    if RECHECK in result.extra:
+    if result.recheck is not None:
         return "Comparison of a stage with a plate known from its calibration"
     return "Self-calibration of a stage with a plate in several views"
 
 
 def known_plate_texts(result: CalibrationResult) -> list[str]:
     """Return which calibration made the plate of a recheck known; nothing of other results."""
-    found = result.extra.get(RECHECK, {}).get("calibration")
-    if not found:
+    if result.recheck is None:
         return []
-    readings, dates = found["readings"], [
-        found[name][:10] for name in ("first_exposure", "last_exposure") if name in found]
-    facts = [f"plan {found['plan_id']}", *([f"run {found['run_id']}"] if found["run_id"] else []),
+    known = result.recheck.calibration
+    readings, dates = known.readings, [
+        instant[:10] for instant in (known.first_exposure, known.last_exposure) if instant]
+    facts = [f"plan {known.plan_id}", *([f"run {known.run_id}"] if known.run_id else []),
              *([f"readings of {' to '.join(dict.fromkeys(dates))}"] if dates else []),
              *([f"{readings['file']}, sha256 {readings['sha256']}"]
                if {"file", "sha256"} <= readings.keys() else []),
-             *([f"evaluated {found['created']}"] if found["created"] else [])]
+             *([f"evaluated {known.created}"] if known.created else [])]
     return [f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
             "uncertainty is the line 'known plate' of the budget"]
 
@@ -114,11 +113,11 @@ def scale_texts(result: CalibrationResult) -> list[str]:
     reference = result.reference
     if not reference:
         why = ("the temperature of the known plate in this measurement was not stated"
-               if RECHECK in result.extra else "no reference length was used")
+               if result.recheck is not None else "no reference length was used")
         return [f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
                 "straightness and squareness do not depend on a reference."]
     texts = []
-    if RECHECK in result.extra:
+    if result.recheck is not None:
         texts.append("The scale is that of the known plate, set at its calibration and converted "
                      "to the temperature of this measurement as follows.")
     for found in reference.get("runs", [reference]):

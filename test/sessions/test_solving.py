@@ -105,7 +105,7 @@ def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
     offline = worded(calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings)))
     assert json.dumps(result_to_dict(replace(shown, run_id=offline.run_id))) == json.dumps(
         result_to_dict(offline))
-    assert shown.extra["recheck"]["of"] == path
+    assert shown.recheck.of == path
     told, = [fields["state"] for output, fields in desk.hands.published if output == "summary"]
     assert told.startswith("Still good: no change since first.json")
     lost = Desk()

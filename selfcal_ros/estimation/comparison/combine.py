@@ -162,9 +162,9 @@ def _require_single_run(part: Part, others: Sequence[Part]) -> None:
 
 def _readings_of_plate(result: CalibrationResult) -> str:
     """Return the SHA-256 of the readings that made the plate of a map known; empty if unknown."""
-    recheck = result.extra.get("recheck")
-    of = result.input if recheck is None else recheck.get("calibration", {}).get("readings", {})
-    return str(of.get("sha256", ""))
+    recheck = result.recheck
+    readings = result.input if recheck is None else recheck.calibration.readings
+    return readings.get("sha256", "")
 
 
 def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:

@@ -206,7 +206,7 @@ def maps_behind(result: CalibrationResult, system: NormalEquations) -> MapsCovar
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
     """Return the system of the weights in a result; None if unknown or not identified."""
     if np.isnan(result.error_map.u_gx).all() or not result.observability.identifiable \
-            or "recheck" in result.extra or not result.views \
+            or result.recheck is not None or not result.views \
             or any(v.read_grid is None or v.read_angular is None for v in result.views):
         return None
     artifact = result.plate

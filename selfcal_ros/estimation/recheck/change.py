@@ -5,8 +5,7 @@ The new map rests on the plate that the earlier calibration found together with 
 it got wrong in one is in the other as well (method eq. 13.3).
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtr
@@ -24,7 +23,15 @@ from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
 from selfcal_ros.estimation.recheck.views import NewMap
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
-from selfcal_ros.model.recheck import Significance
+from selfcal_ros.model.recheck import (
+    LargestChange,
+    LargestTurn,
+    PlateCalibration,
+    Recheck,
+    ScaleChange,
+    Significance,
+)
+from selfcal_ros.model.result import CalibrationResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,33 +171,38 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     return rows, kept, inside.reshape(artifact.shape)
 
 
-def record(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate) -> dict[str, Any]:
-    """Return what a result says of a recheck: `recheck` in RESULT.json, SI units."""
-    before = plate.result
-    dates = {name: text for name in ("first_exposure", "last_exposure")
-             if (text := before.provenance.extra.get(name))}
-    i, j, k = change.worst
-    parts = [part for part in (change, lines) if part.test is not None]
-    p = min(len(parts) * min(part.p for part in parts), 1.0) if parts else float("nan")
-    at = (j, k)
-    largest = {"x": float(artifact.x_m[at]), "y": float(artifact.y_m[at]), "axis": "xy"[i],
-               "change": float(change.values[i, j, k]), "u": float(change.u[i, j, k])}
-    found: dict[str, Any] = {
-        "of": plate.where, "calibration": {
-            "plan_id": before.plan_id, "run_id": before.run_id, "created":
-            before.provenance.created, "readings": dict(before.input), **dates},
-        "changed": bool(p < DIFFERENCE_LEVEL), "p": p, "largest": largest,
-        "rms": rms(change.values), "u_rms": rms(change.u), "p_xy": change.p,
-        "significance_xy": None if change.test is None else asdict(change.test),
-        "scale": {"changed": bool(change.p_scale < DIFFERENCE_LEVEL), "change": change.scale,
-                  "u": change.u_scale, "p": change.p_scale},
-        "dx": change.values[0], "dy": change.values[1], "u_dx": change.u[0], "u_dy": change.u[1]}
+def recheck_found(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate, *,
+                  passes: int) -> Recheck:
+    """Return what a result says of the changes of both maps.
+
+    `passes` are those of the view with the fewest.
+    """
+    axis, *node = change.worst
+    at = tuple(node)
+    largest = LargestChange(float(artifact.x_m[at]), float(artifact.y_m[at]), "xy"[axis],
+                            float(change.values[change.worst]), float(change.u[change.worst]))
+    tested = [part.p for part in (change, lines) if part.test is not None]
+    p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
+    scale = ScaleChange(change.p_scale < DIFFERENCE_LEVEL, change.scale, change.u_scale,
+                        change.p_scale)
+    (dx, dy), (u_dx, u_dy) = change.values, change.u
+    found = Recheck(
+        plate.where, _calibration(plate.result), p < DIFFERENCE_LEVEL, p, largest,
+        rms(change.values), rms(change.u), p_xy=change.p, significance_xy=change.test, scale=scale,
+        dx=dx, dy=dy, u_dx=u_dx, u_dy=u_dy, passes=passes)
     if change.tests is not None:
-        found["detectable"] = change.tests.found(DIFFERENCE_LEVEL / len(parts))
-    if lines.test is not None:
-        line = lines.worst[0]
-        found |= {"p_theta": lines.p, "significance_theta": asdict(lines.test),
-                  "d_theta": lines.values, "u_d_theta": lines.u,
-                  "largest_theta": {"line": line, "change": float(lines.values[line]),
-                                    "u": float(lines.u[line])}}
-    return found
+        found = replace(found, detectable=change.tests.found(DIFFERENCE_LEVEL / len(tested)))
+    if lines.test is None:
+        return found
+    line, = lines.worst
+    return replace(
+        found, p_theta=lines.p, significance_theta=lines.test, d_theta=lines.values,
+        u_d_theta=lines.u, largest_theta=LargestTurn(line, float(lines.values[line]),
+                                                     float(lines.u[line])))
+
+
+def _calibration(result: CalibrationResult) -> PlateCalibration:
+    first, last = (result.provenance.extra.get(name) or None
+                   for name in ("first_exposure", "last_exposure"))
+    return PlateCalibration(result.plan_id, result.run_id, result.provenance.created,
+                            dict(result.input), first, last)

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, i0e, stdtr
 
 from selfcal_ros.model.error_map import MANY_DOF, rms
+from selfcal_ros.model.recheck import Detectable
 
 DRAWS = 2000
 """Draws of the noise of a change; every other one tells how large a change is found."""
@@ -135,10 +136,10 @@ class ChangeTests:
                               else chdtrc(free, square)))
         return min(3 * min(each), 1.0)
 
-    def found(self, level: float) -> dict[str, float]:
-        """Return the changes, m, of which POWER are found if the tests have a level.
+    def found(self, level: float) -> Detectable:
+        """Return the changes of which POWER are found if the tests have a level.
 
-        At one node, any node and direction; and rms of a smooth one, any polynomial.
+        At one node, any node and direction; and a smooth one, any polynomial.
         """
         drawn, least = self._drawn
         rank = int(least[max(int(level * DRAWS) - 1, 0)])
@@ -150,8 +151,8 @@ class ChangeTests:
         one[at, number], one[at + n, number] = np.cos(turn), np.sin(turn)
         smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
         smooth /= np.sqrt((smooth**2).mean(axis=0))
-        return {name: self._size(self.without(shape), noise, limits)
-                for name, shape in (("one_node", one), ("smooth", smooth))}
+        return Detectable(*(self._size(self.without(shape), noise, limits)
+                            for shape in (one, smooth)))
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
         """Return the size of a change of given shape of which POWER are found, by bisection."""

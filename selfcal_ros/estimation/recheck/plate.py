@@ -152,9 +152,9 @@ def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPla
         If it is not qualified, or does not have what the plate's covariance needs; or as
         `reference_now`.
     """
-    if "recheck" in result.extra:
+    if result.recheck is not None:
         raise InputError(where, "is itself a recheck, which does not calibrate a plate",
-                         f"name the calibration that it used, {result.extra['recheck']['of']}")
+                         f"name the calibration that it used, {result.recheck.of}")
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(where, "is not qualified, so its plate is not known",
                          "calibrate again")

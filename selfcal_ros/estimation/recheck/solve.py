@@ -3,7 +3,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -29,7 +28,7 @@ from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import line_change, map_change, record
+from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
 from selfcal_ros.estimation.recheck.plate import KnownPlate, on_plate
 from selfcal_ros.estimation.recheck.same_plate import check_plate
 from selfcal_ros.estimation.recheck.views import (
@@ -50,13 +49,11 @@ from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lin
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import cells_seen
-
-KEY = "recheck"
-"""Key of what a recheck found among the extras of a result."""
 
 MOST_OF_IMAGES = 3200
 """Largest number of readings of images: their covariance is dense, 8 bytes (2 n)^2."""
@@ -147,8 +144,8 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     parts = xy.variances(plate.variance_of_length)
     covers = {"xy": xy.covariance(plate.variance_of_length), "theta": solved.lines.covariance(0.0)}
     change = map_change(solved.new, solved.artifact, plate)
-    found = record(change, line_change(solved.lines, plate), solved.artifact, plate)
-    found["passes"] = min(view.view.repeats for view in measurements.views)
+    found = recheck_found(change, line_change(solved.lines, plate), solved.artifact, plate,
+                          passes=min(view.view.repeats for view in measurements.views))
     noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
@@ -166,26 +163,28 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         views_of(measurements, problem, parameters), Observability(unknowns, unknowns, 0, True),
         noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
-        sense=str(measurements.sense), extra={KEY: found, **kept_covariance(covers)},
+        sense=str(measurements.sense), extra=kept_covariance(covers),
         run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=plate.result.verdict.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
         reference=plate.reference, provenance=provenance_of(measurements, options),
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
-        else None)
+        else None, recheck=found)
     return replace(result, budget=tuple(_budget(result, parts, plate)))
 
 
-def _findings(found: dict[str, Any]) -> tuple[Finding, ...]:
+def _findings(found: Recheck) -> tuple[Finding, ...]:
     """Return what has changed: the map, and the scale that is no part of it."""
-    largest, scale, of = found["largest"], found["scale"], {"of": found["of"]}
-    where = {"x": largest["x"], "y": largest["y"], "passes": found["passes"], **of}
-    both = (Finding("changed", largest["change"], largest["u"], "m", found["p"],
-                    axis=largest["axis"], details=where),
-            Finding("scale_changed", scale["change"], scale["u"], "m/m", scale["p"], details=of))
-    return tuple(one for one, told in zip(both, (found["changed"], scale["changed"]), strict=True)
-                 if told)
+    largest, scale, of = found.largest, found.scale, {"of": found.of}
+    where = {"x": largest.x, "y": largest.y, "passes": found.passes, **of}
+    out: tuple[Finding, ...] = ()
+    if found.changed:
+        out = (Finding("changed", largest.change, largest.u, "m", found.p, axis=largest.axis,
+                       details=where),)
+    if scale.changed:
+        out += (Finding("scale_changed", scale.change, scale.u, "m/m", scale.p, details=of),)
+    return out
 
 
 def plate_readings(measurements: Measurements, options: Options,

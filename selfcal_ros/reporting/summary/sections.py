@@ -351,7 +351,7 @@ def state_sentence(result: CalibrationResult) -> str:
     k = result.noise.k_theta
     text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
     if result.verdict.grade is Grade.GOOD:
-        return f"{result.verdict.sentence}. {text}" if "recheck" in result.extra else text
+        return f"{result.verdict.sentence}. {text}" if result.recheck is not None else text
     said = printable(result.verdict.sentence).rstrip(".")
     return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
 
@@ -377,7 +377,7 @@ def state_line(result: CalibrationResult) -> str:
         u_theta = arcsec(result.noise.k_theta * figures.max_u_theta_rad)
         line += f"{'; ' * bool(parts)}θ up to {arcsec(figures.max_theta_rad)}, U {u_theta}"
 
-    if "recheck" in result.extra and verdict.qualified:
+    if result.recheck is not None and verdict.qualified:
         return f"{verdict.sentence}: {line}."
     if verdict.grade is Grade.GOOD:
         return f"Good: {line}."

@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from selfcal_ros.blocks import blocks
-from selfcal_ros.estimation.recheck.solve import KEY as RECHECK
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words import phrases
@@ -380,8 +379,8 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     verdict = worded_verdict(result.verdict, result.noise)
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
         verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
-    if RECHECK in result.extra and verdict.qualified:
-        verdict = replace(verdict, sentence=phrases.recheck_sentence(result.extra[RECHECK]))
+    if result.recheck is not None and verdict.qualified:
+        verdict = replace(verdict, sentence=phrases.recheck_sentence(result.recheck))
     return replace(result, verdict=verdict, findings=findings,
                    warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))

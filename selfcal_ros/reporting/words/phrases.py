@@ -9,6 +9,7 @@ from typing import Any
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
+from selfcal_ros.model.recheck import LargestChange, Recheck
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
@@ -127,26 +128,27 @@ ONE_PASS = ("a single pass cannot tell a change from drift, two passes can (repe
             "visit_order: there_and_back)")
 
 
-def recheck_sentence(found: Mapping[str, Any]) -> str:
-    """Return the verdict of a recheck in one sentence.
+def recheck_sentence(found: Recheck) -> str:
+    """Return the verdict of a recheck in one sentence."""
+    since, scale, clearest = _since(found.of), found.scale, _clearest(found.largest)
+    if found.changed:
+        return _changed(since, clearest, p=found.p, one_pass=found.passes == 1)
+    if scale.changed:
+        return (f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
+                f"change beyond its uncertainty (p = {found.p:.2g}); {clearest}")
+    return (f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found.p:.2g}); "
+            f"{clearest}")
 
-    Parameters
-    ----------
-    found : mapping
-        ``recheck`` of RESULT.json.
-    """
-    since, scale = printable(os.path.basename(str(found["of"]))), found.get("scale", {})
-    if found["changed"]:
-        drift = f"; {ONE_PASS}" * (found.get("passes") == 1)
-        return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
-                f"clean and placed as planned; {_largest(found['largest'])} "
-                f"(p = {found['p']:.2g}){drift}")
-    if scale.get("changed"):
-        return (f"{_scale_changed(since, scale['change'], scale['u'], scale['p'])}; otherwise no "
-                f"change beyond its uncertainty (p = {found['p']:.2g}); "
-                f"{_largest(found['largest'])}")
-    return (f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found['p']:.2g}); "
-            f"{_largest(found['largest'])}")
+
+def _since(where: str) -> str:
+    """Return the name of the file of a calibration."""
+    return printable(os.path.basename(where))
+
+
+def _changed(since: str, clearest: str, *, p: float, one_pass: bool) -> str:
+    drift = f"; {ONE_PASS}" * one_pass
+    return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
+            f"clean and placed as planned; {clearest} (p = {p:.2g}){drift}")
 
 
 def _scale_changed(since: str, change: float, u: float, p: float) -> str:
@@ -157,13 +159,12 @@ def _scale_changed(since: str, change: float, u: float, p: float) -> str:
 
 def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of encoders whose scale against the plate has changed."""
-    since = printable(os.path.basename(str(of["of"])))
-    return _scale_changed(since, found.size, found.u, found.p)
+    return _scale_changed(_since(str(of["of"])), found.size, found.u, found.p)
 
 
 def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why what was read is not the plate that is known."""
-    since = printable(os.path.basename(str(of["of"])))
+    since = _since(str(of["of"]))
     return (f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
             f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
             "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
@@ -171,37 +172,33 @@ def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
             "again")
 
 
-def _largest(of: Mapping[str, Any]) -> str:
-    at = f"x = {of['x'] * MM_PER_M:.6g}, y = {of['y'] * MM_PER_M:.6g} mm"
-    return (f"clearest at {at}: {of['change'] * UM_PER_M:+.3f} ± {of['u'] * UM_PER_M:.3f} µm along "
-            f"{of['axis']} (k=1)")
+def _clearest(of: LargestChange) -> str:
+    return (f"clearest at x = {of.x * MM_PER_M:.6g}, y = {of.y * MM_PER_M:.6g} mm: "
+            f"{of.change * UM_PER_M:+.3f} ± {of.u * UM_PER_M:.3f} µm along {of.axis} (k=1)")
 
 
-def recheck_lines(found: Mapping[str, Any]) -> list[str]:
+def recheck_lines(found: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
-    scale = found["scale"]
-    out = [f"XY     rms {found['rms'] * UM_PER_M:.5f} µm per axis, "
-           f"u {found['u_rms'] * UM_PER_M:.5f} µm, p = {found['p_xy']:.2g}"]
-    if "detectable" in found:
-        sizes = {name: f"{size * UM_PER_M:.2g} µm" for name, size in found["detectable"].items()}
-        out.append(f"detectable in 9 of 10 cases: {sizes['one_node']} at one node, or a smooth "
-                   f"change of {sizes['smooth']} rms per axis")
-    if "p_theta" in found:
-        line = found["largest_theta"]
-        out.append(f"theta  clearest at line {line['line']}: "
-                   f"{line['change'] * ARCSEC_PER_RAD:+.4f} ± {line['u'] * ARCSEC_PER_RAD:.4f} "
-                   f"arcsec (k=1), p = {found['p_theta']:.2g}")
-    if found.get("passes") == 1:
+    out = [f"XY     rms {found.rms * UM_PER_M:.5f} µm per axis, "
+           f"u {found.u_rms * UM_PER_M:.5f} µm, p = {found.p_xy:.2g}"]
+    if (sizes := found.detectable) is not None:
+        out.append(f"detectable in 9 of 10 cases: {sizes.one_node * UM_PER_M:.2g} µm at one node, "
+                   f"or a smooth change of {sizes.smooth * UM_PER_M:.2g} µm rms per axis")
+    if (turn := found.largest_theta) is not None:
+        out.append(f"theta  clearest at line {turn.line}: "
+                   f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
+                   f"arcsec (k=1), p = {found.p_theta:.2g}")
+    if found.passes == 1:
         out.append(ONE_PASS)
-    return [*out, f"scale  {scale['change'] * UM_PER_M:+.4f} ± {scale['u'] * UM_PER_M:.4f} µm/m "
-            f"against the plate (k=1), p = {scale['p']:.2g}"]
+    scale = found.scale
+    return [*out, f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
+            f"against the plate (k=1), p = {scale.p:.2g}"]
 
 
 def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a stage that has changed."""
-    largest = {"x": of["x"], "y": of["y"], "axis": found.axis, "change": found.size, "u": found.u}
-    return recheck_sentence({"changed": True, "of": of["of"], "p": found.p, "largest": largest,
-                             "passes": of.get("passes")})
+    clearest = _clearest(LargestChange(of["x"], of["y"], found.axis, found.size, found.u))
+    return _changed(_since(str(of["of"])), clearest, p=found.p, one_pass=of.get("passes") == 1)
 
 
 def misfit_text(found: Finding, _: Mapping[str, Any]) -> str:

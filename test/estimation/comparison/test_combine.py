@@ -410,8 +410,9 @@ def test_a_recheck_is_not_combined_with_what_its_plate_is_known_from():
     assert combine([one, other])
 
     def rechecked(run, of):
-        return replace(run, result=replace(run.result, extra={
-            **run.result.extra, "recheck": {"calibration": {"readings": {"sha256": of}}}}))
+        calibration = SimpleNamespace(readings={"sha256": of})
+        return replace(run, result=replace(run.result, recheck=SimpleNamespace(
+            calibration=calibration)))
     assert combine([one, rechecked(other, "c")])
     for pair in ([one, rechecked(other, "a")], [rechecked(other, "a"), one],
                  [rechecked(one, "c"), rechecked(other, "c")]):

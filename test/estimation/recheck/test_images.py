@@ -84,12 +84,12 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     new = project @ gain[:2 * sites]
     change = new - project @ np.hstack([old, np.zeros((len(old), len(late)))])
     y = np.concatenate([values(before), values(after)])
-    recheck_of, shape = found.extra["recheck"], (5, 5)
+    recheck_of, shape = found.recheck, (5, 5)
     for rows, of, u in (
             (new, (found.error_map.gx, found.error_map.gy),
              (found.error_map.u_gx, found.error_map.u_gy)),
-            (change, (recheck_of["dx"], recheck_of["dy"]),
-             (recheck_of["u_dx"], recheck_of["u_dy"]))):
+            (change, (recheck_of.dx, recheck_of.dy),
+             (recheck_of.u_dx, recheck_of.u_dy))):
         spread = np.sqrt(np.diag(rows @ noise @ rows.T))
         for axis in range(2):
             np.testing.assert_allclose(u[axis], spread[axis::2].reshape(shape), rtol=1e-5)
@@ -124,13 +124,13 @@ def population(image_m, runs, **settings):
         later, before, after = sessions(image_m, seed, plate_shape_m=5e-9, **settings)
         first = calibrate(before)
         result = calibrate(after, Options(plate=first, plate_from="r.json"))
-        emap, told = result.error_map, result.extra["recheck"]
+        emap, told = result.error_map, result.recheck
         modes = datum_modes(emap.artifact, scale=True)
         away.append(remove_modes(np.stack([emap.gx, emap.gy]) - later.g, modes)
                     / np.stack([emap.u_gx, emap.u_gy]))
         if not settings.get("change"):
-            changes.append(np.stack([told["dx"], told["dy"]])
-                           / np.stack([told["u_dx"], told["u_dy"]]))
+            changes.append(np.stack([told.dx, told.dy])
+                           / np.stack([told.u_dx, told.u_dy]))
         results.append(result)
     return np.array(away), np.array(changes), results
 
@@ -149,13 +149,13 @@ def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
     assert all(result.verdict.qualified for result in results)
     require_within(away)
     require_within(changes)
-    assert sum(result.extra["recheck"]["changed"] for result in results) <= 2
+    assert sum(result.recheck.changed for result in results) <= 2
 
 
 def test_a_changed_stage_is_said_to_have_changed():
     away, _, results = population(MARK, 4, change=2e-7)
     require_within(away)
-    assert all(result.extra["recheck"]["changed"] for result in results)
+    assert all(result.recheck.changed for result in results)
 
 
 def test_what_a_view_with_images_will_tell_is_predicted():

@@ -4,6 +4,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,21 +100,21 @@ def require_first_order(emap):
 
 def require_same(result, wanted, *, rel=1e-5):
     """Require map, change and their covariances as one least squares has them."""
-    emap, found = result.error_map, result.extra["recheck"]
+    emap, found = result.error_map, result.recheck
     for rows, values, u in (
             (wanted.after, (emap.gx, emap.gy), (emap.u_gx, emap.u_gy)),
-            (wanted.change, (found["dx"], found["dy"]), (found["u_dx"], found["u_dy"]))):
+            (wanted.change, (found.dx, found.dy), (found.u_dx, found.u_dy))):
         of, spread = wanted.of(rows)
         assert np.ravel(u)[wanted.known] == pytest.approx(spread, rel=rel)
         assert np.abs(np.ravel(values)[wanted.known] - of).max() < rel * spread.min()
         assert np.isnan(np.ravel(values)[~wanted.known]).all()
     chi2, dof = wanted.chi2
-    test = found["significance_xy"]
-    assert test["dof"] == dof
-    assert test["chi2_ratio"] == pytest.approx(chi2 / dof, rel=100 * rel)
+    test = found.significance_xy
+    assert test.dof == dof
+    assert test.chi2_ratio == pytest.approx(chi2 / dof, rel=100 * rel)
     if wanted.K:
         for rows, value, u in ((wanted.after_theta, emap.g_theta, emap.u_g_theta),
-                               (wanted.change_theta, found["d_theta"], found["u_d_theta"])):
+                               (wanted.change_theta, found.d_theta, found.u_d_theta)):
             of, spread = wanted.of(rows)
             assert u == pytest.approx(spread, rel=rel)
             assert np.abs(value - of).max() < rel * spread.min()
@@ -126,8 +127,8 @@ def require_same(result, wanted, *, rel=1e-5):
         assert whole and cover == pytest.approx(wanted.after_theta @ wanted.after_theta.T,
                                                 abs=rel * cover.max())
     u = np.linalg.norm(wanted.scale)
-    assert found["scale"]["change"] == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
-    assert found["scale"]["u"] == pytest.approx(u, rel=rel)
+    assert found.scale.change == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
+    assert found.scale.u == pytest.approx(u, rel=rel)
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -192,11 +193,24 @@ def test_terms_with_sizes_are_part_of_the_noise():
     for name in ("u_gx", "u_gy"):
         u, more = (getattr(result.error_map, name) for result in (plain, strained))
         assert more == pytest.approx(np.hypot(u, both), rel=1e-6)
-    more = strained.extra["recheck"]["scale"]["u"]
-    assert more == pytest.approx(np.hypot(plain.extra["recheck"]["scale"]["u"], size), rel=1e-6)
+    more = strained.recheck.scale.u
+    assert more == pytest.approx(np.hypot(plain.recheck.scale.u, size), rel=1e-6)
     np.testing.assert_allclose(strained.error_map.gx, plain.error_map.gx, atol=1e-15)
     assert [line.component for line in strained.budget] == [
         "reading noise", "known plate", "terms", "interpolation"]
+
+
+def test_what_has_changed_is_read_as_it_was_written():
+    written = recheck(sessions()[1], linear(), known_plate(calibrated(), "r.json"))
+    data = result_to_dict(worded(written))
+    assert {"of", "changed", "p", "largest", "dx", "largest_theta"} < set(data["recheck"])
+    read = saved(written)
+    assert read.recheck.to_dict() == data["recheck"]
+    np.testing.assert_array_equal(read.recheck.u_dy, written.recheck.u_dy)
+    assert type(read.recheck.largest) is type(written.recheck.largest)
+    data["recheck"]["largest"] = 3
+    with pytest.raises(InputError, match="r: damaged result"):
+        result_from_dict(data, "r")
 
 
 def test_the_noise_is_that_of_many_repeats_or_of_the_calibration():
@@ -252,8 +266,8 @@ def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
 @pytest.mark.parametrize(("change", "message"), [
     ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
     ({"method": "law"}, "does not contain the covariance of its plate"),
-    ({"extra": {"recheck": {"of": "first.json"}}}, "which does not calibrate a plate; name "
-                                                   "the calibration that it used, first.json")])
+    ({"recheck": SimpleNamespace(of="first.json")}, "which does not calibrate a plate; name "
+                                                    "the calibration that it used, first.json")])
 def test_results_without_a_known_plate(change, message):
     with pytest.raises(InputError, match=f"r.json: .*{message}"):
         known_plate(replace(calibrated(), **change), "r.json")
@@ -351,7 +365,7 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
     beside = replace(truth, t_m=np.array([[5e-4, -4e-4]]), phi_rad=truth.phi_rad[:1])
     after = simulate_measurements(beside, one_view(artifact), rng, visits=True, settings=settings)
     plate = known_plate(first, "r.json")
-    found = recheck(after, BARE, plate).extra["recheck"]
-    assert not found["changed"]
-    at_sites = recheck(after, replace(BARE, at_places=False), plate).extra["recheck"]
-    assert at_sites["changed"] and at_sites["rms"] > 1.5 * found["rms"]
+    found = recheck(after, BARE, plate).recheck
+    assert not found.changed
+    at_sites = recheck(after, replace(BARE, at_places=False), plate).recheck
+    assert at_sites.changed and at_sites.rms > 1.5 * found.rms

@@ -117,7 +117,7 @@ def test_a_bent_stage_and_a_few_marks_are_not_another_plate(size):
     for bent in (size * np.stack([x * y, x**2]), size * np.stack([np.sin(4 * y), np.sin(4 * x)]),
                  few):
         result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent), BARE, plate))
-        assert result.extra["recheck"]["changed"]
+        assert result.recheck.changed
         assert result.verdict.sentence.startswith("Changed since r.json: calibrate again, provided")
 
 
@@ -127,9 +127,9 @@ def test_a_scale_that_has_changed_is_the_headline():
     for sign in (1, -1):
         result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, a=truth.a + sign * grown), BARE,
                                 plate))
-        found = result.extra["recheck"]
-        assert found["scale"]["changed"] and not found["changed"]
-        assert abs(abs(found["scale"]["change"]) - 5e-6) < 3 * found["scale"]["u"]
+        found = result.recheck
+        assert found.scale.changed and not found.changed
+        assert abs(abs(found.scale.change) - 5e-6) < 3 * found.scale.u
         assert result.verdict.sentence.startswith("Scale changed since r.json by ")
         assert "temperature of the plate or of the encoders" in result.warnings[0]
         assert result.verdict.grade is Grade.GOOD

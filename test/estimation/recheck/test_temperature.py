@@ -65,7 +65,7 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
         modes = datum_modes(PLAN.artifact, scale=True)
         error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, modes[:3 if told else 4])
         ratios.append(error / np.stack([emap.u_gx, emap.u_gy]))
-        scales.append(result.extra["recheck"]["scale"]["p"])
+        scales.append(result.recheck.scale.p)
         assert (result.reference is not None) is told is is_traceable(result)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.12)
     changed = sum(p < 0.05 for p in scales)
