@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
@@ -30,10 +30,95 @@ DIFFERENCE_LEVEL = 0.05
 """Probability that maps of the same stage differ significantly, both tests together."""
 
 DRAWS = 2000
-"""Draws of the largest |z|: fifty of them exceed its limit."""
+"""Draws of noise: fifty of them exceed the limit of the largest |z|."""
 
 NO_VARIANCE = 1e-9
 """Relative variance of a value or combination that the datum removes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Noise of n values from which columns were taken off by least squares.
+
+    Attributes
+    ----------
+    covariance : float array (n, n) or (n,)
+        Of the values before, or their variances if the correlations are unknown.
+    removed : float array (n, k)
+        The columns.
+    dof : float
+        Degrees of freedom of the noise behind the covariance.
+    """
+
+    covariance: np.ndarray
+    removed: np.ndarray
+    dof: float
+
+    @cached_property
+    def _basis(self) -> np.ndarray:
+        return np.linalg.qr(self.removed)[0]
+
+    def without(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n, ...) without the columns `removed`."""
+        return values - self._basis @ (self._basis.T @ values)
+
+    @property
+    def correlated(self) -> bool:
+        """Whether the correlations are known."""
+        return self.covariance.ndim == 2
+
+    @cached_property
+    def remaining(self) -> np.ndarray:
+        """Covariance, or variances, of the values without the columns."""
+        return without(self.covariance, self._basis)
+
+    @cached_property
+    def variance(self) -> np.ndarray:
+        """Variance of each value without the columns, (n,)."""
+        return np.diag(self.remaining) if self.correlated else self.remaining
+
+    @property
+    def varies(self) -> np.ndarray:
+        """Values that the columns leave a variance, bool (n,)."""
+        return self.variance > NO_VARIANCE * self.variance.max()
+
+    @cached_property
+    def u(self) -> np.ndarray:
+        """Standard uncertainty of each value, (n,)."""
+        return np.sqrt(np.maximum(self.variance, NO_VARIANCE * self.variance.max()))
+
+    @cached_property
+    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations (r,) and axes (n, r) of the values over `u`."""
+        values, vectors = np.linalg.eigh(self.remaining / np.outer(self.u, self.u))
+        determined = values > NO_VARIANCE * values[-1]
+        return np.sqrt(values[determined]), vectors[:, determined]
+
+    @property
+    def rank(self) -> int:
+        """Number of independent values."""
+        if self.correlated:
+            return len(self._axes[0])
+        return max(int(self.varies.sum()) - self.removed.shape[1], 1)
+
+    def squares(self, ratio: np.ndarray) -> np.ndarray:
+        """Return the squared Mahalanobis distances of values over `u`, (n, ...)."""
+        if not self.correlated:
+            return (ratio**2).sum(axis=0)
+        size, axes = self._axes
+        return (((axes.T @ ratio).T / size) ** 2).sum(axis=-1)
+
+    @cached_property
+    def drawn(self) -> np.ndarray:
+        """Values over `u` that are noise only, (n, DRAWS).
+
+        By the symmetric root of their correlation, which rounding does not turn as it turns axes.
+        """
+        rng, (size, axes) = np.random.default_rng(0), self._axes
+        ratio = (axes * size) @ (axes.T @ rng.standard_normal((len(axes), DRAWS)))
+        if self.dof > MANY_DOF:
+            return ratio
+        return ratio / np.sqrt(rng.chisquare(self.dof, DRAWS) / self.dof)
 
 
 def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
@@ -59,25 +144,24 @@ def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
     correlated = all(flag for _, flag in covariances)
     total = np.sum([covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
                     for covariance, _ in covariances], axis=0)
-    if not np.isfinite(total).all() or not total.any():
+    return significance_in(Spread(total, removed, noise_dof), values)
+
+
+def significance_in(spread: Spread, values: np.ndarray) -> Significance | None:
+    """Test values (n,) without columns against their noise; None if that is unknown or none."""
+    covariance, dof = spread.covariance, spread.dof
+    if not np.isfinite(covariance).all() or not covariance.any():
         return None
-    q = np.linalg.qr(removed)[0]
-    total = without(total, q)
-    variance = np.diag(total).copy() if correlated else total
-    good = variance > NO_VARIANCE * variance.max()
-    z = values[good] / np.sqrt(variance[good])
-    if correlated:
-        scale = np.sqrt(variance[good])
-        square, dof, root = _mahalanobis(z, total[np.ix_(good, good)] / np.outer(scale, scale))
-    else:
-        square, dof, root = float(z @ z), float(max(len(z) - q.shape[1], 1)), None
-    p = float(fdtrc(dof, noise_dof, square / dof) if noise_dof <= MANY_DOF
-              else chdtrc(dof, square))
-    largest = float(abs(z).max())
-    p_z, limit = _of_largest(largest, len(z), root, noise_dof)
-    of_largest = variance[np.abs(values).argmax()]
-    return Significance(square / dof, dof, p, correlated, largest, limit, p_z, noise_dof,
-                        min(p, p_z) < DIFFERENCE_LEVEL / 2, u_rms=float(np.sqrt(variance.mean())),
+    ratio, varies, rank = values / spread.u, spread.varies, spread.rank
+    square = float(spread.squares(np.where(varies, ratio, 0.0)))
+    p = float(fdtrc(rank, dof, square / rank) if dof <= MANY_DOF else chdtrc(rank, square))
+    largest = float(abs(ratio[varies]).max())
+    drawn = abs(spread.drawn[varies]).max(axis=0) if spread.correlated else None
+    p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
+    of_largest = spread.variance[np.abs(values).argmax()]
+    return Significance(square / rank, float(rank), p, spread.correlated, largest, limit, p_z, dof,
+                        min(p, p_z) < DIFFERENCE_LEVEL / 2,
+                        u_rms=float(np.sqrt(spread.variance.mean())),
                         u_largest=float(np.sqrt(max(of_largest, 0.0))))
 
 
@@ -89,32 +173,20 @@ def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
     return covariance - (covariance @ q) @ q.T
 
 
-def _mahalanobis(z: np.ndarray, correlation: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Return the squared distance, its degrees of freedom, and a root of the correlation."""
-    values, vectors = np.linalg.eigh(correlation)
-    told = values > NO_VARIANCE * values[-1]
-    part = vectors[:, told].T @ z / np.sqrt(values[told])
-    return float(part @ part), float(told.sum()), vectors[:, told] * np.sqrt(values[told])
-
-
-def _of_largest(largest: float, n: int, root: np.ndarray | None,
+def _of_largest(largest: float, n: int, drawn: np.ndarray | None,
                 noise_dof: float) -> tuple[float, float]:
     """Return the probability of such a |z| among n values, and the limit of DIFFERENCE_LEVEL / 2.
 
-    The number of values bounds it (Bonferroni); draws give it for correlated nodes, except
-    in the far tail, where the bound is close.
+    The number of values bounds it (Bonferroni); the largest |z| of draws, if there are any, give it
+    for correlated nodes, except in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)
     bound = min(float(2 * n * stdtr(dof, -largest)), 1.0)
     limit = -float(stdtrit(dof, DIFFERENCE_LEVEL / 4 / n))
-    if root is None:
+    if drawn is None:
         return bound, limit
-    rng = np.random.default_rng(0)
-    drawn = abs(root @ rng.standard_normal((root.shape[1], DRAWS))).max(axis=0)
-    if noise_dof <= MANY_DOF:
-        drawn = drawn / np.sqrt(rng.chisquare(noise_dof, DRAWS) / noise_dof)
-    above = int(DIFFERENCE_LEVEL / 2 * (DRAWS + 1))
-    p = (1 + np.count_nonzero(drawn >= largest)) / (1 + DRAWS)
+    above = int(DIFFERENCE_LEVEL / 2 * (len(drawn) + 1))
+    p = (1 + np.count_nonzero(drawn >= largest)) / (1 + len(drawn))
     return min(bound, float(p)), min(limit, float(np.sort(drawn)[-above]))
 
 

@@ -14,9 +14,9 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
     PITCH_TOLERANCE,
+    Spread,
     joint_dof,
-    significance,
-    without,
+    significance_in,
 )
 from selfcal_ros.estimation.recheck.detection import ChangeTests
 from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
@@ -92,14 +92,14 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
     z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[:artifact.m.size]]
-    tests = ChangeTests(z, covariance, basis, dof)
+    tests = ChangeTests(covariance, basis, dof, z)
     in_datum = tests.without(values)
-    test = significance(in_datum, [(covariance, True)], basis, dof)
+    test = significance_in(tests, in_datum)
     row = scale_row(modes)
     scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
 
     out = np.full((2, len(common)), np.nan)
-    out[:, common] = in_datum, _u_without(covariance, basis)
+    out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
     changes, u = out.reshape(2, 2, *artifact.shape)
     return Change(changes, u, test, 1.0 if test is None else tests.p(in_datum), scale, u_scale,
                   2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
@@ -140,10 +140,10 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
     values, of_new, of_old = _difference(new, common, np.eye(count), np.nan_to_num(old))
     dof = joint_dof((np.trace(of_new), new.dof),
                     (np.trace(of_old), plate.result.noise.dof_theta))
-    constant = np.ones((len(values), 1))
+    spread = Spread(of_new + of_old, np.ones((len(values), 1)), dof)
     values = values - values.mean()
-    out[:, common] = values, _u_without(of_new + of_old, constant)
-    test = significance(values, [(of_new + of_old, True)], constant, dof)
+    out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
+    test = significance_in(spread, values)
     return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
@@ -151,11 +151,6 @@ def scale_row(modes: np.ndarray) -> np.ndarray:
     """Return the least-squares scale as a row, (n,), given translations, rotation and scale."""
     size = np.abs(modes).max(axis=0)
     return np.linalg.pinv(modes / size)[3] / size[3]
-
-
-def _u_without(cover: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return standard uncertainties after the least-squares parts in a basis are taken off."""
-    return np.sqrt(np.maximum(np.diag(without(cover, np.linalg.qr(basis)[0])), 0.0))
 
 
 def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,7 +2,8 @@
 """Whether a map has changed, and how large a change is found (method eq. 13.4).
 
 Three statistics of the same change: one for a change at all nodes, one for a change at few, one for
-a smooth change. Draws of the change's noise give the probability of the most telling of the three.
+a smooth change. Draws of the change's noise give the probability of the most telling of the three;
+every other one tells how large a change is found.
 """
 
 from dataclasses import dataclass
@@ -11,11 +12,9 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtrc, fdtrc, i0e, stdtr
 
+from selfcal_ros.estimation.comparison.maps import DRAWS, NO_VARIANCE, Spread
 from selfcal_ros.model.error_map import MANY_DOF, rms
 from selfcal_ros.model.recheck import Detectable
-
-DRAWS = 2000
-"""Draws of the noise of a change; every other one tells how large a change is found."""
 
 FEW, LARGE = 3.0, 3.0
 """Number of changed nodes, and their change in standard uncertainties, of the second statistic."""
@@ -29,53 +28,18 @@ ORDER = 2
 POWER = 0.9
 """Part of the changes of the size stated as found that are found."""
 
-NO_VARIANCE = 1e-9
-"""Relative variance of a combination of nodes that the datum removes."""
-
 
 @dataclass(frozen=True, eq=False)
-class ChangeTests:
-    """Statistics of changes of a map, Gx first, then Gy, free from the columns `removed`.
+class ChangeTests(Spread):
+    """Statistics of changes of a map, Gx first, then Gy, (2n,), without what the datum removes.
 
     Attributes
     ----------
     places : complex array (n,)
         Nodes, in any unit.
-    covariance : float array (2n, 2n)
-        Of a change, before the columns are removed, m^2.
-    removed : float array (2n, k)
-        What the datum removes by least squares.
-    dof : float
-        Degrees of freedom of the noise behind the covariance.
     """
 
     places: np.ndarray
-    covariance: np.ndarray
-    removed: np.ndarray
-    dof: float
-
-    def without(self, values: np.ndarray) -> np.ndarray:
-        """Return values (2n, ...) without the columns `removed`."""
-        q = np.linalg.qr(self.removed)[0]
-        return values - q @ (q.T @ values)
-
-    @cached_property
-    def _own(self) -> np.ndarray:
-        """Covariance of a change, (2n, 2n)."""
-        return self.without(self.without(self.covariance).T)
-
-    @cached_property
-    def u(self) -> np.ndarray:
-        """Standard uncertainty of a change, (2n,), m."""
-        variance = np.diag(self._own)
-        return np.sqrt(np.maximum(variance, NO_VARIANCE * variance.max()))
-
-    @cached_property
-    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Standard deviations (r,) and axes (2n, r) of the change over `u`."""
-        values, vectors = np.linalg.eigh(self._own / np.outer(self.u, self.u))
-        determined = values > NO_VARIANCE * values[-1]
-        return np.sqrt(values[determined]), vectors[:, determined]
 
     @cached_property
     def _smooth(self) -> np.ndarray:
@@ -90,30 +54,26 @@ class ChangeTests:
     @cached_property
     def _whiten_smooth(self) -> np.ndarray:
         """Rows from a change to its polynomials, of variance 1 and independent, (k, 2n)."""
-        factor = np.linalg.cholesky(self._smooth.T @ self._own @ self._smooth)
+        factor = np.linalg.cholesky(self._smooth.T @ self.remaining @ self._smooth)
         return np.linalg.solve(factor, self._smooth.T)
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """Return the three statistics of changes (2n, draws), (3, draws)."""
-        size, axes = self._axes
         ratio = values / self.u[:, None]
         few = np.hypot(*ratio.reshape(2, -1, ratio.shape[1]))
         part = FEW / len(few)
         likelier = np.logaddexp(np.log1p(-min(part, 0.5)), np.log(part) + LARGE * few
                                 - LARGE**2 / 2 + np.log(i0e(LARGE * few)))
-        return np.stack([((axes.T @ ratio / size[:, None]) ** 2).sum(axis=0),
-                         likelier.sum(axis=0), ((self._whiten_smooth @ values) ** 2).sum(axis=0)])
+        return np.stack([self.squares(ratio), likelier.sum(axis=0),
+                         ((self._whiten_smooth @ values) ** 2).sum(axis=0)])
 
     @cached_property
     def _noise(self) -> np.ndarray:
         """Changes that are noise only, (2n, DRAWS), m."""
-        rng, (size, axes) = np.random.default_rng(0), self._axes
-        drawn = (self.u[:, None] * axes * size) @ rng.standard_normal((len(size), DRAWS))
-        return drawn if self.dof > MANY_DOF else drawn / np.sqrt(
-            rng.chisquare(self.dof, DRAWS) / self.dof)
+        return self.u[:, None] * self.drawn
 
     @cached_property
-    def _drawn(self) -> tuple[np.ndarray, np.ndarray]:
+    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics of noise, each in order, (3, DRAWS), and the least rank from above, sorted."""
         found = self.of(self._noise)
         ranks = DRAWS - np.argsort(np.argsort(found, axis=1), axis=1)
@@ -121,7 +81,7 @@ class ChangeTests:
 
     def p(self, values: np.ndarray) -> float:
         """Return the probability of as significant a change, (2n,), if there is none."""
-        found, (drawn, least) = self.of(values[:, None])[:, 0], self._drawn
+        found, (drawn, least) = self.of(values[:, None])[:, 0], self._ranked
         rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
                    for row, one in zip(drawn, found, strict=True))
         p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
@@ -131,7 +91,7 @@ class ChangeTests:
         """Return a bound of the probability, close where it is small (Bonferroni)."""
         dof, n = min(self.dof, MANY_DOF), len(self.u)
         each = [2 * n * float(stdtr(dof, -np.abs(values / self.u).max()))]
-        for square, free in ((found[0], len(self._axes[0])), (found[2], self._smooth.shape[1])):
+        for square, free in ((found[0], self.rank), (found[2], self._smooth.shape[1])):
             each.append(float(fdtrc(free, dof, square / free) if self.dof <= MANY_DOF
                               else chdtrc(free, square)))
         return min(3 * min(each), 1.0)
@@ -141,7 +101,7 @@ class ChangeTests:
 
         At one node, any node and direction; and a smooth one, any polynomial.
         """
-        drawn, least = self._drawn
+        drawn, least = self._ranked
         rank = int(least[max(int(level * DRAWS) - 1, 0)])
         limits = drawn[:, -rank][:, None]
         rng, noise = np.random.default_rng(1), self._noise[:, ::2]

@@ -13,6 +13,7 @@ from scipy.stats import t as student_t
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import (
     DIFFERENCE_LEVEL,
+    Spread,
     _of_largest,
     compare,
     significance,
@@ -146,7 +147,8 @@ def test_nodes_that_move_together_are_as_one(noise_dof):
     """Of ten equal values the largest is Student's or normal itself, not one of ten."""
     alone = student_t(noise_dof) if np.isfinite(noise_dof) else norm
     limit = alone.isf(DIFFERENCE_LEVEL / 4)
-    p, found = _of_largest(limit, 10, np.ones((10, 1)), noise_dof)
+    drawn = Spread(np.ones((10, 10)), np.zeros((10, 0)), noise_dof).drawn
+    p, found = _of_largest(limit, 10, abs(drawn).max(axis=0), noise_dof)
     assert p == pytest.approx(DIFFERENCE_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
     assert found == pytest.approx(limit, rel=0.06)
     apart, bound = _of_largest(limit, 10, None, noise_dof)

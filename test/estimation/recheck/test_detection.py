@@ -21,7 +21,7 @@ def change_tests(dof: float) -> ChangeTests:
     z = (PLATE.x_m + 1j * PLATE.y_m).ravel()
     near = np.exp(-np.abs(z[:, None] - z) / 0.02)
     modes = datum_modes(PLATE, scale=True).reshape(4, -1).T
-    return ChangeTests(z, np.kron(np.diag([1.0, 4.0]), near) * 1e-16, modes, dof)
+    return ChangeTests(np.kron(np.diag([1.0, 4.0]), near) * 1e-16, modes, dof, z)
 
 
 def noise(tests: ChangeTests, rng, number=DRAWS) -> np.ndarray:
@@ -44,7 +44,7 @@ def test_the_level_is_the_nominal_one(dof):
 @pytest.mark.parametrize("level", [0.05, 0.025])
 def test_nine_of_ten_changes_of_the_stated_size_are_found(kind, level):
     tests, rng, n = change_tests(np.inf), np.random.default_rng(6), PLATE.m.size
-    size, shape = tests.found(level)[kind], np.zeros((2, n, DRAWS))
+    size, shape = getattr(tests.found(level), kind), np.zeros((2, n, DRAWS))
     if kind == "one_node":
         at, turn = rng.integers(n, size=DRAWS), rng.uniform(0, 2 * np.pi, DRAWS)
         shape[:, at, np.arange(DRAWS)] = np.cos(turn), np.sin(turn)
@@ -64,7 +64,7 @@ def test_nine_of_ten_changes_of_the_stated_size_are_found(kind, level):
 def test_smooth_changes_and_those_of_few_nodes_are_found_better_than_by_one_sum_of_squares():
     """Independent nodes, one by 5.5 u, or a bend of 0.5 u rms: the sum finds two of three."""
     modes = datum_modes(PLATE, scale=True).reshape(4, -1).T
-    tests, rng = ChangeTests(change_tests(12.0).places, np.eye(98), modes, np.inf), (
+    tests, rng = ChangeTests(np.eye(98), modes, np.inf, change_tests(12.0).places), (
         np.random.default_rng(7))
     bend = tests.without(np.concatenate([tests.places.real**2, 0 * tests.places.real]))
     limit = chi2.ppf(0.95, 94)
