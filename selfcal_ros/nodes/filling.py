@@ -125,7 +125,9 @@ def diagnosis_of(status: DiagnosticStatus) -> Diagnosis:
                      {item.key: item.value for item in status.values})
 
 
-INK = (0.1, 0.1, 0.1)
+UNKNOWN_PITCH_M = 1e-3
+"""Of a plate with a list of marks, for the size of what is drawn."""
+INK, RED = (0.1, 0.1, 0.1), (0.8, 0.1, 0.1)
 
 
 def map_markers(error_map: ErrorMap, stamp_ns: int, frame_id: str) -> MarkerArray:
@@ -147,6 +149,24 @@ def map_markers(error_map: ErrorMap, stamp_ns: int, frame_id: str) -> MarkerArra
         marker(2, Marker.TEXT_VIEW_FACING, "legend", scale={"z": wide / 3}, text=shape.legend,
                pose={"position": dict(zip("xyz", shape.legend_at, strict=True)),
                      "orientation": {"w": 1.0}})])
+
+
+def rejected_marker(measurement: Any, frame_id: str) -> Marker:
+    """Return where the stage stood at the rejected detections of a view.
+
+    It takes the place of that of the view's earlier measurement, and deletes it if there are none.
+    """
+    wide = measurement.map_grid_pitch or measurement.grid_pitch or UNKNOWN_PITCH_M
+    places = np.stack([measurement.rejected_x, measurement.rejected_y], axis=1)
+    known = np.isfinite(places).all(axis=1)
+    above = np.full((known.sum(), 1), wide / 20)  # the vectors of the map
+    return fill(Marker(), {
+        "header": {"stamp": measurement.header.stamp, "frame_id": frame_id},
+        "ns": "rejected", "id": int(measurement.view_index), "type": Marker.POINTS,
+        "action": Marker.ADD if known.any() else Marker.DELETE,
+        "scale": {"x": wide / 5, "y": wide / 5}, "color": _colour(RED),
+        "pose": {"orientation": {"w": 1.0}},
+        "points": _points(np.hstack([places[known], above]))})
 
 
 def _points(places: np.ndarray) -> list[Point]:

@@ -7,10 +7,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from selfcal_msgs.srv import LoadMap, SaveMap
+from visualization_msgs.msg import Marker
 
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.filling import map_markers
+from selfcal_ros.nodes.filling import map_markers, rejected_marker
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
@@ -49,6 +50,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._outputs = {"map": self.output(names.ERROR_MAP),
                          "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
+        self._rejected: dict[int, Marker] = {}  # by view
         self._solved = self.publisher(names.private(names.SOLVED))
         self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
 
@@ -63,12 +65,18 @@ class Solver(ManagedNode[SolverSettings]):
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         if output == "markers":
-            self._markers.publish(map_markers(**fields, frame_id=self.settings.frame_id))
+            array = map_markers(**fields, frame_id=self.settings.frame_id)
+            array.markers = [*array.markers, *self._rejected.values()]
+            self._markers.publish(array)
         else:
             self._outputs[output](fields)
 
     def _on_measurement(self, message: Any) -> None:
         self.session.take_measurement(message)
+        if message.image_x == message.image_y == 0:  # the rejections of all cells
+            marker, view = rejected_marker(message, self.settings.frame_id), message.view_index
+            if view in self._rejected or marker.action == Marker.ADD:
+                self._rejected[view] = marker
         self._begin()
 
     def _on_command(self, message: Any) -> None:

@@ -375,6 +375,28 @@ def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
     assert legend.text == shape.legend
 
 
+def test_rejected_detections_are_shown_until_their_view_is_measured_without(graph, tmp_path):
+    graph.node(Solver, frame_id="cell", result_folder=str(tmp_path))
+    arrays = graph.listen(names.MAP_MARKERS)
+    readings = graph.publisher(names.MEASUREMENT)
+    messages, _ = measured()
+    messages[1].reject_reasons, messages[1].reject_counts = ["low_score"], [2]
+    messages[1].rejected_reason = [0, 0]
+    messages[1].rejected_x, messages[1].rejected_y = [0.01, np.nan], [-0.02, 0.0]
+    for message in messages:
+        readings.publish(message)
+    graph.until(lambda: arrays and len(arrays[-1].markers) == 4, "the rejected detection")
+    shown = arrays[-1].markers[-1]
+    assert (shown.ns, shown.id, shown.type, shown.action) == ("rejected", 1, Marker.POINTS,
+                                                              Marker.ADD)
+    assert [(p.x, p.y) for p in shown.points] == [(0.01, -0.02)] and shown.color.r > shown.color.g
+    assert shown.header.frame_id == "cell"
+    again, _ = measured()
+    again[1].sigma_xy *= 1.01  # another measurement
+    readings.publish(again[1])
+    graph.until(lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the view without")
+
+
 def test_a_malformed_measurement_does_not_end_the_solver(graph):
     node = graph.node(Solver)
     summaries = graph.listen(names.SUMMARY)
