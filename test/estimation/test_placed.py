@@ -23,7 +23,7 @@ from test.support.truth import simulate_measurements
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
-COUNT = 16
+COUNT = 8
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
@@ -152,7 +152,7 @@ def waves(rng, length):
 def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
     """The lack of fit is in U at the nodes, whether the test fails or not."""
     inside, contradicted = [], 0
-    for seed in range(12):
+    for seed in range(8):
         rng = np.random.default_rng([seed, length])
         found, truth = readings(plate(11, 7), SIX, rng, sigma=0.1e-6, stage=waves(rng, length))
         result = calibrate(found, BARE)
@@ -163,7 +163,7 @@ def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
         named = "roughness" in [cause.name for cause in result.verdict.causes]
         assert result.verdict.grade == ("enlarged" if named else "good")
         contradicted += named
-    assert contradicted >= 11 if rough else contradicted == 0
+    assert contradicted >= 7 if rough else contradicted == 0
     assert 0.93 < np.mean(inside) <= 1.0
 
 

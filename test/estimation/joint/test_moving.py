@@ -44,10 +44,10 @@ def off(truth, result):
         [emap.u_gx, emap.u_gy])
 
 
-def twenty(**how):
-    """Return the maps of 20 machines in both senses: which qualify, which hold, error over u."""
+def maps_of(machines, **how):
+    """Return the maps of machines in both senses: which qualify, which hold, error over u."""
     plan, qualified, holds, errors = hu_plan(Artifact(11, 0.01, 24), 5), [], [], []
-    for seed in range(20):
+    for seed in range(machines):
         truth, readings = measured(plan, seed, sense=tuple(Sense)[seed % 2], **FOLLOWS, **how)
         result = calibrate(readings, bare())
         errors.append(off(truth, result))
@@ -57,19 +57,19 @@ def twenty(**how):
 
 
 def test_plates_a_tenth_of_a_pitch_beside_cost_nothing():
-    qualified, holds, z = twenty()
+    qualified, holds, z = maps_of(10)
     assert qualified.all() and holds.all()
     assert 0.97 <= z <= 1.03
 
 
 def test_plates_two_tenths_beside_are_held_as_well():
-    qualified, holds, z = twenty(t_m=2e-3)
-    assert qualified.sum() >= 18 and holds.all()
+    qualified, holds, z = maps_of(10, t_m=2e-3)
+    assert qualified.sum() >= 9 and holds.all()
     assert z <= 1.05
 
 
 def test_a_stage_too_rough_for_it_is_rather_not_qualified_than_wrong():
-    qualified, holds, _ = twenty(t_m=2e-3, length=2.0)
+    qualified, holds, _ = maps_of(20, t_m=2e-3, length=2.0)
     assert (~qualified).sum() > (qualified & ~holds).sum()
     assert holds.sum() >= 19
 
@@ -90,7 +90,7 @@ def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(m
                                 for truth, readings in made]))
 
     made = [measured(plan_of("0,90,tx", Artifact(7, 0.01)), seed, t_m=2e-3, **FOLLOWS)
-            for seed in range(20)]
+            for seed in range(10)]
     held = ratio()
     monkeypatch.setattr(fitting, "FAR", np.inf)
     assert held == pytest.approx(1, abs=0.1)
