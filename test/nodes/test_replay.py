@@ -53,15 +53,21 @@ def ordered_plan():
                                      for view in plan.views))
 
 
-@pytest.fixture(scope="module", params=[ordered_plan(), placed_plan(count=8, repeats=2),
-                                        image_plan(5, count=8, repeats=2), listed_plan(),
-                                        image_plan(6, count=8, repeats=2)],
-                ids=["on the lattice", "placed", "images", "a list of marks", "even sides"])
+PLANS = {"on the lattice": ordered_plan(), "placed": placed_plan(count=8, repeats=2),
+         "images": image_plan(5, count=8, repeats=2), "a list of marks": listed_plan(),
+         "even sides": image_plan(6, count=8, repeats=2)}
+
+
+@pytest.fixture(scope="module")
 def solved(request, tmp_path_factory):
-    """Return a bag and the text of the result that `selfcal solve` writes for it."""
-    folder = tmp_path_factory.mktemp("replay")
-    ordered = bool(request.param.views[0].visit_order)
-    bag = small_bag(folder, request.param, **REJECTED if ordered else {})
+    """Return a bag and the text of the result that `selfcal solve` writes for it.
+
+    On the lattice, unless a test names another of `PLANS`.
+    """
+    folder, plan = tmp_path_factory.mktemp("replay"), PLANS[getattr(
+        request, "param", "on the lattice")]
+    ordered = bool(plan.views[0].visit_order)
+    bag = small_bag(folder, plan, **REJECTED if ordered else {})
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) in (0, 5)
     assert ("rejected_at" in read_json(folder / "solved.json")) is ordered
     return bag, undated((folder / "solved.json").read_text())
@@ -97,8 +103,9 @@ def result_text(session, bag, folder, cell=None):
     return undated((folder / "replayed.json").read_text())
 
 
-@pytest.mark.parametrize("options", [{}, {"rate": 50.0}, {"seed": 3}],
-                         ids=["fast", "at a rate", "shuffled"])
+@pytest.mark.parametrize(("solved", "options"), [
+    ("on the lattice", {}), ("on the lattice", {"rate": 50.0}), ("images", {"rate": 50.0}),
+    *((name, {"seed": 3}) for name in PLANS)], indirect=["solved"])
 def test_a_session_gives_the_result_of_solve_bit_for_bit(
         graph, solved, tmp_path, options, capfd):
     bag, expected = solved
