@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 import os
+import pickle
 from collections import Counter
 from dataclasses import replace
 from functools import partial
@@ -257,16 +258,19 @@ def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
     _, measurements, progress = collected(events_of(plan))
     views = [fill(names.MEASUREMENT.type(), from_model.view_measurement(
         view, measurements, 5, "stage")) for view in progress.values()]
-    answers = Counter()
+    answers, solved = Counter(), set()
     for name, spoilt in worst(views[1]):
-        if name.endswith(TEXT_FIELDS):
+        if name.endswith(TEXT_FIELDS) or isinstance(getattr(spoilt, name, None), str):
             continue
         session = SolvingSession(settings_of("solver"), Hands().ports)
         for view in views:
             session.take_measurement(view)
         try:
             session.take_measurement(spoilt)
-            session.take(solve(session.next_job()))
+            job = session.next_job()
+            if (same := pickle.dumps(job)) not in solved:  # many a field is of other plans
+                session.take(solve(job))
+            solved.add(same)
             answers["solved"] += 1
         except InputError as error:
             answers[error.what.partition(" ")[0]] += 1
