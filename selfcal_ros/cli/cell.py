@@ -65,7 +65,7 @@ def _try(args: argparse.Namespace) -> int:
     with connected(cell, lambda line: print(line, file=aside(args))) as machine:
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
         pixels, marks = trial.look()
-        print("position: " + ", ".join(f"{axis} {value:.6g}" for axis, value in zip(
+        print("position: " + ", ".join(f"{axis} {value + 0.0:.6g}" for axis, value in zip(
             trial.position.names, trial.position.positions, strict=True)), file=aside(args))
         if pixels is not None:
             write_bytes(output, circled(pixels, marks, trial.mark_pixels))

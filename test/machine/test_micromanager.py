@@ -2,65 +2,41 @@
 """Micro-Manager's real core with its demo stage; the plate lies where that stage says it is."""
 
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
-from selfcal_ros.machine.measuring import Run
+from selfcal_ros.machine.cell import open_machine, read_cell, with_values
+from selfcal_ros.machine.measuring import Run, collector_settings
 from selfcal_ros.machine.micromanager import MicroManagerMachine
 from test.machine.test_measuring import away_from
-from test.support.cells import Agreeing, write_cell
+from test.support.cells import Agreeing
 
 pymmcore = pytest.importorskip("pymmcore")
 pytest.importorskip("mm_test_adapters")
-CONFIG = """Property,Core,Initialize,0
-Device,Stage,DemoCamera,DXYStage
-Device,Camera,DemoCamera,DCam
-Property,Core,Initialize,1
-Property,Core,XYStage,Stage
-Property,Core,Camera,Camera
-"""
-
-
-class PlateCore:
-    """The real core, with a camera that renders the plate at the position of the demo stage."""
-
-    def __init__(self, simulated) -> None:
-        self._core, self._simulated = pymmcore.CMMCore(), simulated
-
-    def __getattr__(self, name):
-        return getattr(self._core, name)
-
-    def snapImage(self):
-        self._core.snapImage()
-        x, y = self._core.getXYPosition(self._core.getXYStageDevice())
-        self._simulated.move_to((x * 1e-6, y * 1e-6, 0.0))
-
-    def getImage(self):
-        return self._simulated.image().pixels
+EXAMPLE = Path(__file__).parents[2] / "examples" / "microscope"
 
 
 @pytest.fixture
 def config(tmp_path):
-    path = tmp_path / "demo.cfg"
-    path.write_text(CONFIG)
-    return str(path)
+    shutil.copytree(EXAMPLE, tmp_path, dirs_exist_ok=True)
+    return str(tmp_path / "demo.cfg")
 
 
-def test_the_map_is_right_within_its_uncertainty(tmp_path, config):
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=(
-        "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
-        "cell: {servo_sigma: 0.0}\n"))
-    machine = MicroManagerMachine(config, core=PlateCore(simulated))
-    machine.place = simulated.place
+def test_the_example_finds_the_map_within_its_uncertainty(tmp_path, config):
+    with_values(tmp_path / "cell.yaml", "detector", {"pixel_size": 1e-6, "turn": 3.0}, {})
+    cell = read_cell(tmp_path / "cell.yaml")
+    machine = open_machine(cell)
     try:
         Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
             Agreeing()).measure()
     finally:
         machine.close()
-    away, result = away_from(simulated.truth, tmp_path / "bag")
+    away, result = away_from(machine.plate.truth, tmp_path / "bag", collector_settings(cell))
     u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
     assert np.abs(away).max() < 4 * u.max() < 1e-7
 
@@ -105,12 +81,12 @@ def test_a_stage_that_does_not_arrive_in_time_is_stopped(config):
         machine.close()
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("".join(line for line in CONFIG.splitlines(True) if "Stage" not in line), "no XY stage"),
-    (CONFIG.replace("DXYStage", "NoStage"), "cannot be loaded")])
-def test_a_configuration_that_does_not_do(config, text, said):
-    with open(config, "w") as file:
-        file.write(text)
+@pytest.mark.parametrize(("name", "other", "said"), [
+    ("Core,XYStage,Stage", "Core,XYStage,", "no XY stage"),
+    ("DXYStage", "NoStage", "cannot be loaded")])
+def test_a_configuration_that_does_not_do(config, name, other, said):
+    path = Path(config)
+    path.write_text(path.read_text().replace(name, other))
     with pytest.raises(MachineError, match=said):
         MicroManagerMachine(config)
 

@@ -18,6 +18,8 @@ ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
     "replay": "run by test/nodes/test_replay.py",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
+    "cell try": "asks a person; test/cli/test_cell_try.py",
+    "measure examples/microscope": "needs pymmcore; run by test/machine/test_micromanager.py",
     "cell check": "needs a cell; test/nodes/test_cell_check.py"}
 """Verbs whose commands are parsed alone, and why."""
 PLACES = ("BAG", "/tmp/session", "$", "FILE.cal")
