@@ -101,8 +101,8 @@ def known_are(word: str, known: Iterable[str]) -> str:
 
 def mend_of(value: object, kind: type) -> str:
     """Return the remedy for a value that is not of the type `kind`."""
-    if kind is list:
-        return f"write [{value}]" if isinstance(value, str) else "give a list"
+    if kind is list and isinstance(value, str):
+        return f"write [{value}]"
     if not isinstance(value, str) or kind not in (int, float):
         return "correct the value"
     if re.fullmatch(r"[-+\d]*,\d+([eE][-+]?\d+)?", value.strip()):

@@ -26,7 +26,7 @@ from selfcal_ros.batch.table import (
     series_of,
     summary_lines,
 )
-from selfcal_ros.cli.solve import add_options, parameters
+from selfcal_ros.cli.solve import ROBUST, add_options, parameters
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError, first_line, printable
 from selfcal_ros.outputs import write_json, write_text
@@ -53,7 +53,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--baseline", metavar="RESULT.json",
                         help="test every map against this one, and name those that differ")
     add_json(parser, "the contents of batch.json instead of a summary")
-    add_options(parser)
+    add_options(parser, ROBUST)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("plate_from", metavar="RESULT.json",
                         help="calibration of the plate")
-    solve.add_arguments(parser, known_plate=True)
+    solve.add_arguments(parser, {"theta_datum": "theta_datum", "reference_at": "reference_at"})
 
 
 def run(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 
 import argparse
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -52,18 +53,23 @@ from selfcal_ros.reporting.words.tables import budget_text, validation_json, val
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    add_arguments(parser)
+    add_arguments(parser, SOLVER)
     parser.add_argument("--validate", action="store_true",
                         help="hold out tenths of the readings and whole views, and predict them")
 
 
-def add_arguments(parser: argparse.ArgumentParser, *, known_plate: bool = False) -> None:
-    """Add what `selfcal solve` and `selfcal recheck` have in common."""
+def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> None:
+    """Add what `selfcal solve` and `selfcal recheck` have in common, and options as `names`."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
     parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
                         "- is stdout, and other output goes to stderr")
     add_json(parser, "RESULT.json, and the summary on stderr")
-    add_options(parser, known_plate=known_plate)
+    add_options(parser, names)
+    parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
+                        "scale: artifact, stage_x or stage_y, its relative error and the standard "
+                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
+                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
+                        "marks marks:ID:ID:LENGTH:U")
     parser.set_defaults(validate=False)
     parser.add_argument("--budget", action="store_true",
                         help="print the uncertainty budget of the map (GUM)")
@@ -79,24 +85,26 @@ METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "mis
           "uncertainty": "uncertainty"}
 REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
 ROBUST = {"robust": "robust"}
+SOLVER = METHOD | REFERENCE | ROBUST
 SENSE = {"sense": "measurement_sense"}
 """Options for parameters of solver and collector -> their names."""
 
 
-def add_options(parser: argparse.ArgumentParser, *, known_plate: bool = False) -> None:
-    """Add the options for collecting and solving a bag, or a view of a plate that is known."""
-    kept = {"theta_datum": "theta_datum"} if known_plate else METHOD | ROBUST
-    add_parameters(parser, SolverSettings, kept)
-    parser.set_defaults(**dict.fromkeys((METHOD | ROBUST).keys() - kept))
+def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> None:
+    """Add the options for collecting and solving a bag.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Where to.
+    names : mapping
+        Options for parameters of the solver -> their names; the others are set by --params alone.
+    """
+    add_parameters(parser, SolverSettings, names)
+    parser.set_defaults(reference=None, **dict.fromkeys(SOLVER.keys() - names))
     add_parameters(parser, CollectorSettings, SENSE)
     parser.add_argument("--params", metavar="NODES.yaml",
                         help="ROS parameter file, the same as for the nodes")
-    parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
-                        "scale: artifact, stage_x or stage_y, its relative error and the standard "
-                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
-                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
-                        "marks marks:ID:ID:LENGTH:U")
-    add_parameters(parser, SolverSettings, REFERENCE)
     parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
                         help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
                         "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
@@ -113,7 +121,7 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
     """Return the settings of collector and solver; options take precedence over the file."""
     collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
     solver = node_settings(args.params, SolverSettings, model_terms=_model(args),
-                           **given(args, METHOD | REFERENCE | ROBUST), **_reference(args.reference))
+                           **given(args, SOLVER), **_reference(args.reference))
     of_plate = {"reference_at"} if getattr(args, "plate_from", "") else set()
     for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":

@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
                         help="draw the error without and with the correction side by side")
     parser.add_argument("--json", action="store_true", help="print JSON (docs/guides/verify.md)")
-    solve.add_options(parser, known_plate=True)
+    solve.add_options(parser, {})
 
 
 def run(args: argparse.Namespace) -> int:
