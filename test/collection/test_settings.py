@@ -74,7 +74,8 @@ def test_names_are_unique_in_a_node():
 
 @pytest.mark.parametrize(("name", "value", "message"), [
     ("max_sped", 1.0, "measurement_collector has no such parameter; did you mean 'max_speed'?"),
-    ("max_speed", "fast", "'fast' is not of type float; give a number in SI units, without a unit and without quotes"),
+    ("max_speed", "fast", "'fast' is not of type float; give a number in SI units, without a "
+     "unit and without quotes"),
     ("max_speed", True, "True is not of type float; correct the value"),
     ("max_speed", math.nan, "nan is outside 0.0 to 1.0 m/s; correct the value"),
     ("max_speed", math.inf, "inf is outside 0.0 to 1.0 m/s; correct the value"),
