@@ -47,7 +47,7 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     noise = plate.result.noise
     root = np.sqrt(min(view.repeats for view in plan.views))
     unit = noise.sigma_xy / root
-    emap = found.error_map(plate)
+    emap = found.error_map()
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
     return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
                           rms(map_change(found.new, found.artifact, plate).u) / unit)

@@ -84,7 +84,7 @@ class KnownPlate:
         return np.concatenate([lattice.x_m[marks], lattice.y_m[marks], np.zeros(4)])
 
     @property
-    def microscope(self) -> np.ndarray | None:
+    def of_offsets(self) -> np.ndarray | None:
         """Coefficients of the microscope that it found, (4,); None if it did not estimate them."""
         term = next((term for term in self.result.model.terms
                      if block_of(term.name).of_offsets), None)

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -33,6 +34,8 @@ from selfcal_ros.estimation.recheck.plate import KnownPlate, on_plate
 from selfcal_ros.estimation.recheck.same_plate import check_plate
 from selfcal_ros.estimation.recheck.views import (
     NOISE,
+    PLATE,
+    TEMPERATURE,
     TERMS,
     NewMap,
     PlateReadings,
@@ -68,6 +71,8 @@ class Rechecked:
 
     Attributes
     ----------
+    plate : KnownPlate
+        The plate.
     readings : PlateReadings
         The readings.
     solution : PlateSolution
@@ -78,6 +83,7 @@ class Rechecked:
         Noise of one reading of each kind.
     """
 
+    plate: KnownPlate
     readings: PlateReadings
     solution: PlateSolution
     new: NewMap
@@ -90,16 +96,22 @@ class Rechecked:
         """Nodes of the map."""
         return self.readings.measurements.artifact.field
 
-    def in_datum(self, plate: KnownPlate) -> NewMap:
-        """Return the XY map, without scale unless a reference length sets it."""
-        if plate.reference is not None:
+    @cached_property
+    def in_datum(self) -> NewMap:
+        """The XY map, without scale unless a reference length sets it."""
+        if self.plate.reference is not None:
             return self.new
         return self.new.without(datum_modes(self.artifact, scale=True).reshape(4, -1).T)
 
-    def error_map(self, plate: KnownPlate) -> ErrorMap:
+    @cached_property
+    def variances(self) -> dict[str, np.ndarray]:
+        """Variances of this map by their sources, (q,) each, m^2."""
+        return self.in_datum.variances(self.plate.variance_of_length)
+
+    def error_map(self) -> ErrorMap:
         """Return the map with its uncertainty."""
-        artifact, xy = self.artifact, self.in_datum(plate)
-        variance = np.sum(list(xy.variances(plate.variance_of_length).values()), axis=0)
+        artifact, xy = self.artifact, self.in_datum
+        variance = np.sum(list(self.variances.values()), axis=0)
         (gx, gy), (u_x, u_y) = (xy.whole(part).reshape(2, *artifact.shape)
                                 for part in (xy.values, np.sqrt(variance)))
         u_theta = np.sqrt(np.diag(self.lines.covariance(0.0)))
@@ -116,7 +128,7 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
     readings = plate_readings(on_plate(measurements, plate), options, plate)
     xy, theta = _noise(readings, plate)
     new, solution = _new_map(readings, plate, xy, options)
-    return Rechecked(readings, solution, new, _new_lines(readings, plate, theta), xy, theta)
+    return Rechecked(plate, readings, solution, new, _new_lines(readings, plate, theta), xy, theta)
 
 
 @one_thread()
@@ -140,13 +152,12 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     """
     solved = recheck_of(measurements, options, plate)
     readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
-    xy = solved.in_datum(plate)
-    parts = xy.variances(plate.variance_of_length)
-    covers = {"xy": xy.covariance(plate.variance_of_length), "theta": solved.lines.covariance(0.0)}
+    covers = {"xy": solved.in_datum.covariance(plate.variance_of_length),
+              "theta": solved.lines.covariance(0.0)}
     change = map_change(solved.new, solved.artifact, plate)
     found = recheck_found(change, line_change(solved.lines, plate), solved.artifact, plate,
                           passes=min(view.view.repeats for view in measurements.views))
-    noise = _with_coverage(noise_of(solved.xy, solved.theta), parts, plate)
+    noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
         solution.square, solution.dof,
@@ -159,7 +170,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     parameters = np.full(problem.system.size, np.nan)
     parameters[:len(solution.parameters)] = solution.parameters
     result = CalibrationResult(
-        measurements.plan_id, solved.error_map(plate), plate.result.artifact_map,
+        measurements.plan_id, solved.error_map(), plate.result.artifact_map,
         views_of(measurements, problem, parameters), Observability(unknowns, unknowns, 0, True),
         noise, measurements.all_rejected(),
         findings=() if failed else _findings(found),
@@ -171,7 +182,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         reference=plate.reference, provenance=provenance_of(measurements, options),
         placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
         else None, recheck=found)
-    return replace(result, budget=tuple(_budget(result, parts, plate)))
+    return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
 
 
 def _findings(found: Recheck) -> tuple[Finding, ...]:
@@ -248,19 +259,19 @@ def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, N
 def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
              options: Options) -> tuple[NewMap, PlateSolution]:
     """Return the map of the stage, stage frame, and as it was solved."""
-    microscope, declared = plate.microscope, any(term.block.of_offsets for term in options.terms)
-    calibrated = microscope is not None and not declared
+    offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
+    calibrated = offsets is not None and not declared
     terms = readings.of_terms(lambda block: not block.of_lines
                               and not (calibrated and block.of_offsets))
-    of_microscope = readings.of_microscope() * calibrated
-    of_plate = np.hstack([readings.of_marks(), stacked(of_microscope)])
+    of_offsets = readings.of_offsets() * calibrated
+    of_plate = np.hstack([readings.of_marks(), stacked(of_offsets)])
     noise = _noise_of_marks(readings, plate, xy.sigma, stacked(terms))
     sites, marks = plate.kept.sites, readings.marks
     before = plate.kept.cover(sites, marks)
     of_marks = before[2 * sites.sum():, 2 * sites.sum():]
     solution = plate_solution(
         readings, noise.covariance + of_plate @ of_marks @ of_plate.T,
-        plate.field[readings.at[1:]], of_microscope @ (microscope if calibrated else np.zeros(4)))
+        plate.field[readings.at[1:]], of_offsets @ (offsets if calibrated else np.zeros(4)))
 
     field, known = solution.field, solution.known
     rows = solution.rows[:2 * known.size].reshape(2, *known.shape, -1)
@@ -325,9 +336,8 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
 def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
     """Return the noise with degrees of freedom and k of the map's uncertainty."""
     before = plate.result.noise
-    dof = joint_dof((parts["reading noise"].mean(), noise.dof_xy),
-                    (parts["known plate"].mean(), before.dof_of("xy")),
-                    (parts["plate temperature"].mean() + parts["terms"].mean(), np.inf))
+    dof = joint_dof((parts[NOISE].mean(), noise.dof_xy), (parts[PLATE].mean(), before.dof_of("xy")),
+                    (parts[TEMPERATURE].mean() + parts[TERMS].mean(), np.inf))
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
     return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
                    k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
@@ -336,23 +346,23 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
 def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
             plate: KnownPlate) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
-    noise, of_plate = result.noise, plate.result.artifact_map
-    u = {"reading noise": noise.sigma_xy, "terms": float("nan"),
-         "known plate": rms(np.stack([of_plate.u_ax, of_plate.u_ay])),
-         "plate temperature": float(np.sqrt(plate.variance_of_length))}
-    kinds = {"reading noise": ("A", noise.dof_xy, "readings"), "terms": ("B", np.inf, "default"),
-             "known plate": ("A", plate.result.noise.dof_of("xy"), "declared"),
-             "plate temperature": ("B", np.inf, "declared")}
+    noise, of_plate, inf = result.noise, plate.result.artifact_map, float("inf")
     by = next((way for way in ("declared", "repeats")
                if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy), "residuals")
+    rows: dict[str, tuple[str, float, str, float, str]] = {
+        NOISE: ("A", noise.sigma_xy, "m", noise.dof_xy, "readings"),
+        PLATE: ("A", rms(np.stack([of_plate.u_ax, of_plate.u_ay])), "m",
+                plate.result.noise.dof_of("xy"), "declared"),
+        TEMPERATURE: ("B", float(np.sqrt(plate.variance_of_length)), "m/m", inf, "declared"),
+        TERMS: ("B", float("nan"), "m", inf, "default")}
     for name, variance in parts.items():
-        if name == "plate temperature" and plate.reference is None:
+        if name == TEMPERATURE and plate.reference is None:
             continue
-        (kind, dof, source), each = kinds[name], np.sqrt(variance)
-        details: dict[str, object] = {"plate": plate.where} if name != "reading noise" else {
-            "by": by, "contradicted": False}
-        unit = "m/m" if name == "plate temperature" else "m"
-        yield BudgetLine("xy", name, kind, 0.0, u[name], unit, rms(each), float(each.max()), dof,
+        (kind, u, unit, dof, source), u_map = rows[name], np.sqrt(variance)
+        details: dict[str, object] = {"plate": plate.where}
+        if name == NOISE:
+            details = {"by": by, "contradicted": False}
+        yield BudgetLine("xy", name, kind, 0.0, u, unit, rms(u_map), float(u_map.max()), dof,
                          source, details)
     yield from (line for line in budget_lines(result)
                 if (line.quantity, line.component) == ("xy", INTERPOLATION))

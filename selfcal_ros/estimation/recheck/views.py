@@ -38,7 +38,8 @@ STILL = 1e-13
 """Change of a reading, m, that counts as zero."""
 
 NOISE, TERMS = "reading noise", "terms"
-"""Sources of the noise of readings."""
+PLATE, TEMPERATURE = "known plate", "plate temperature"
+"""Sources of the uncertainty of a map: of the readings, and of what is known of the plate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +135,8 @@ class NewMap:
         """
         parts = self.noise.variances(self.rows)
         of_plate = np.einsum("ij,ij->i", self.from_plate @ self._cover_of_plate, self.from_plate)
-        return {NOISE: parts[NOISE], "known plate": np.maximum(of_plate, 0.0),
-                "plate temperature": variance_of_length * self.from_length**2,
-                TERMS: parts[TERMS]}
+        return {NOISE: parts[NOISE], PLATE: np.maximum(of_plate, 0.0),
+                TEMPERATURE: variance_of_length * self.from_length**2, TERMS: parts[TERMS]}
 
     def covariance(self, variance_of_length: float) -> np.ndarray:
         """Return the covariance of the map, (q, q); argument as of `variances`."""
@@ -253,7 +253,7 @@ class PlateReadings:
         rows = self.columns.having(trait)
         return self.of_each(self.columns.grid[rows]) * self.columns.size[rows]
 
-    def of_microscope(self) -> np.ndarray:
+    def of_offsets(self) -> np.ndarray:
         """Return the readings for a unit of each coefficient of the microscope, complex (r, 4)."""
         out = np.zeros((len(self.at[0]), len(MICROSCOPE_PARTS)), dtype=complex)
         rows = np.flatnonzero(self.columns.having(lambda block: block.of_offsets))
@@ -319,7 +319,7 @@ class PlateSolution:
 
 
 def plate_solution(readings: PlateReadings, covariance: np.ndarray, plate: np.ndarray,
-                   of_microscope: np.ndarray) -> PlateSolution:
+                   of_offsets: np.ndarray) -> PlateSolution:
     """Return the map of the stage for a covariance of the readings.
 
     Parameters
@@ -328,7 +328,7 @@ def plate_solution(readings: PlateReadings, covariance: np.ndarray, plate: np.nd
         The readings.
     covariance : float array (2 r, 2 r)
         Of the readings less what is known, m^2.
-    plate, of_microscope : complex array (r,)
+    plate, of_offsets : complex array (r,)
         Known error of the plate, and effect of the microscope, m.
 
     Raises
@@ -343,7 +343,7 @@ def plate_solution(readings: PlateReadings, covariance: np.ndarray, plate: np.nd
                         stacked(readings.of_misalignments())])
     read = fields.any(axis=0).reshape(readings.problem.system.grid.views.shape)
     known, rows = _known_nodes(readings, design, covariance, read)
-    y = readings.problem.grid.y[readings.at] - plate - of_microscope
+    y = readings.problem.grid.y[readings.at] - plate - of_offsets
     unknowns, residual = _settled(readings, rows, design, known=known, y=y, plate=plate)
     n, rank = known.size, round(float(np.einsum("ij,ji->", rows, design)))
     field = np.where(known, (unknowns[:n] + 1j * unknowns[n:2 * n]).reshape(known.shape), 0.0)
