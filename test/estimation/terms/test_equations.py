@@ -12,6 +12,13 @@ from selfcal_ros.estimation.terms.equations import TermEquations
 SIGMA = 2e-8
 
 
+class Made(TermEquations):
+    """Equations whose information, norm and columns are given."""
+
+    def limit(self, rows):
+        return 1e-9
+
+
 def equations(columns, size, whole, *, taken=()):
     """Return equations of real columns (readings, p), free where `size` (p,) is infinite.
 
@@ -20,13 +27,9 @@ def equations(columns, size, whole, *, taken=()):
     """
     left = columns.copy()
     left[:, taken] *= 1e-16
-    own = SimpleNamespace(
-        n=len(size), free=np.isinf(size), columns=SimpleNamespace(size=size),
-        information=left.T @ left, unbiased=left.T @ left,
-        norm=whole * np.sqrt((columns**2).sum(axis=0)),
-        limit=lambda _: 1e-9)
-    own.untold = lambda rows: TermEquations.untold(own, rows)
-    own.prior = lambda sigma_m: TermEquations.prior(own, sigma_m)
+    own = Made(None, SimpleNamespace(columns=size, size=size), None)
+    own.__dict__.update(information=left.T @ left, unbiased=left.T @ left,
+                        norm=whole * np.sqrt((columns**2).sum(axis=0)))
     return own
 
 
@@ -61,7 +64,7 @@ def test_untold_combinations_have_no_covariance_and_the_others_their_own(
         unit = np.sqrt(np.diag(inner))
         wanted = basis @ (np.linalg.inv(inner / np.outer(unit, unit)) / np.outer(unit, unit)
                           ) @ basis.T
-        found = TermEquations.inverse(own, SIGMA)
+        found = own.inverse(SIGMA)
         # in units of each one's uncertainty; where that is nothing but rounding, of its column
         spread = np.sqrt(np.diag(wanted))
         spread = np.where(spread * own.norm < 1e-9, 1 / own.norm, spread)
