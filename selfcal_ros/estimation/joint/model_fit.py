@@ -22,13 +22,13 @@ from selfcal_ros.estimation.joint.problem import FLOOR, ROUNDING, Problem, grid_
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
     TermEquations,
+    equations_of_columns,
     next_coefficients,
     residual_sums,
     score,
 )
 from selfcal_ros.estimation.terms.projection import (
     ReducedColumns,
-    project,
     reduce_anew,
     reduce_columns,
 )
@@ -173,13 +173,10 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
                  reduced: ReducedColumns | None = None) -> TermEquations:
     """Return the equations of columns about the estimate `found`."""
-    if reduced is None:
-        reduced = reduce_columns(problem.system.grid, columns.shapes)
-    known = list(filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals)))
-    projected = project(problem.system, reduced, found.inverse, columns.lines, ratio=found.ratio,
-                        half_width_m=problem.half_width_m)
-    return TermEquations(problem.system, columns, projected, min(known, default=0.0),
-                         found.ratio * problem.half_width_m**2)
+    noises = filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals))
+    return equations_of_columns(
+        problem.system, columns, found.inverse, ratio=found.ratio, reduced=reduced,
+        half_width_m=problem.half_width_m, noise_m=min(noises, default=0.0))
 
 
 class _State:

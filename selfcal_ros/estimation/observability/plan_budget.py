@@ -24,7 +24,7 @@ from selfcal_ros.estimation.observability.plan_check import (
 )
 from selfcal_ros.estimation.observability.prediction import MAX_SITES, Prediction
 from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
-from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
+from selfcal_ros.estimation.terms.planned import Assumed, planned_equations
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
@@ -141,15 +141,9 @@ def effects_of_terms(plan: Plan, terms: Iterable[ModelTerm], assumed: Assumed,
                      ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the variances of the XY map (2, sites), m^2, and of the lines (K,), rad^2, by term."""
     system = planned_system(plan.artifact, plan.views)
-    ground = planned_ground(plan.artifact, plan.views, system, assumed)
-    equations = planned_equations(system, ground, terms, assumed)
-    out = {}
-    for name, root in roots_by_term(equations.inverse(assumed.sigma_m), equations.columns):
-        moved, turned = (part @ root * assumed.sigma_m for part in (
-            equations.maps, equations.turned))
-        out[name] = (np.stack([(moved.real**2).sum(axis=1), (moved.imag**2).sum(axis=1)]),
-                     (turned**2).sum(axis=1))
-    return out
+    equations = planned_equations(plan, system, terms, assumed)
+    roots = roots_by_term(equations.inverse(assumed.sigma_m), equations.columns)
+    return {name: equations.variances(assumed.sigma_m**2 * root @ root.T) for name, root in roots}
 
 
 def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],

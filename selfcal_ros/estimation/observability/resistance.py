@@ -28,7 +28,6 @@ from selfcal_ros.estimation.terms.planned import (
     SEED,
     Assumed,
     planned_equations,
-    planned_ground,
     rows_of,
     with_terms,
 )
@@ -110,9 +109,8 @@ class PlannedTerms:
         self.model, self.assumed = tuple(model), assumed
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
-        ground = planned_ground(plan.artifact, plan.views, system, assumed)
         sized = [ModelTerm(name, size) for name, size in nominal_sizes().items()]
-        self.every = planned_equations(system, ground, sized, assumed)
+        self.every = planned_equations(plan, system, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
     def require_told(self, seen: Observability) -> None:
@@ -231,9 +229,8 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
     repeats : int
         Repeats of the averaged reading whose noise is the unit.
     """
-    spread, shape = terms.inverse(terms.noise_m) * repeats, alone.ux.shape
-    x, y, lines = (np.einsum("sp,pq,sq->s", part, spread, part, optimize=True)
-                   for part in (terms.maps.real, terms.maps.imag, terms.turned))
+    (x, y), lines = terms.variances(terms.inverse(terms.noise_m) * repeats)
+    shape = alone.ux.shape
     u_theta = np.sqrt(alone.u_theta**2 + terms.line_weight * lines) if (
         len(alone.u_theta)) else alone.u_theta
     return replace(alone, ux=np.sqrt(alone.ux**2 + x.reshape(shape)),

@@ -33,7 +33,7 @@ from selfcal_ros.estimation.observability.prediction import Prediction, predict
 from selfcal_ros.estimation.observability.rank import deficiency, full_observability
 from selfcal_ros.estimation.observability.resistance import with_part_of_terms
 from selfcal_ros.estimation.observability.unseen import equivalent_key
-from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
+from selfcal_ros.estimation.terms.planned import Assumed, planned_equations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.terms import ModelTerm
@@ -159,8 +159,7 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
     repeats = repeats or unit_repeats(plan)
     found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
     if against is not None and against.every:
-        ground = planned_ground(plan.artifact, plan.views, system, against.assumed)
-        terms = planned_equations(system, ground, against.every, against.assumed)
+        terms = planned_equations(plan, system, against.every, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
             return Score(hidden, inf, inf, inf, of_terms=True)

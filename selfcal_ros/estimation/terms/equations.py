@@ -9,7 +9,12 @@ import numpy as np
 
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import TermColumns
-from selfcal_ros.estimation.terms.projection import ProjectedColumns
+from selfcal_ros.estimation.terms.projection import (
+    ProjectedColumns,
+    ReducedColumns,
+    project,
+    reduce_columns,
+)
 
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is zero."""
@@ -144,6 +149,15 @@ class TermEquations:
         turned = self.projected.turned
         return turned - turned[known].mean(axis=0) if known.any() else turned
 
+    def variances(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances that coefficients with a covariance (p, p) give the maps.
+
+        (2, sites) of the XY map, and (K,) of the angular one.
+        """
+        x, y, lines = (np.einsum("sp,pq,sq->s", part, covariance, part, optimize=True)
+                       for part in (self.maps.real, self.maps.imag, self.turned))
+        return np.stack([x, y]), lines
+
     def unseen(self, rows: np.ndarray) -> np.ndarray:
         """Return undetermined combinations of `rows` that change the map, scaled, (p, modes)."""
         untold = self.untold(rows)
@@ -244,6 +258,31 @@ class TermEquations:
     def rank(self) -> int:
         """Return the number of combinations of all coefficients determined by the readings."""
         return self.n - self.untold(np.ones(self.n, dtype=bool)).shape[1]
+
+
+def equations_of_columns(system: NormalEquations, columns: TermColumns, inverse: np.ndarray, *,
+                         ratio: float, half_width_m: float, noise_m: float,
+                         reduced: ReducedColumns | None = None) -> TermEquations:
+    """Return the equations of columns of readings that are planned, or about an estimate.
+
+    Parameters
+    ----------
+    system, columns : NormalEquations, TermColumns
+        The readings, and the terms.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit noise of one grid reading.
+    ratio, half_width_m : float
+        Weight of a line, and the unit of the misalignments, m.
+    noise_m : float
+        Noise of one grid reading, m; 0 if unknown.
+    reduced : ReducedColumns, optional
+        The columns with the sites eliminated, if that is done.
+    """
+    if reduced is None:
+        reduced = reduce_columns(system.grid, columns.shapes)
+    projected = project(system, reduced, inverse, columns.lines, ratio=ratio,
+                        half_width_m=half_width_m)
+    return TermEquations(system, columns, projected, noise_m, ratio * half_width_m**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,18 +16,14 @@ from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, term_columns
-from selfcal_ros.estimation.terms.equations import TermEquations
-from selfcal_ros.estimation.terms.projection import (
-    ProjectedColumns,
-    project,
-    reduce_columns,
-)
+from selfcal_ros.estimation.terms.equations import TermEquations, equations_of_columns
+from selfcal_ros.estimation.terms.projection import ProjectedColumns
 from selfcal_ros.estimation.terms.shapes import WithinMarks
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
-from selfcal_ros.model.view import View, placings_of, with_sub_views
+from selfcal_ros.model.view import Plan, View, placings_of, with_sub_views
 from selfcal_ros.model.visit_order import approach_signs, visit_sequence
 
 MISALIGNMENT_M = 30e-6
@@ -143,23 +139,23 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
                       approach_signs((sites + aside).imag).astype(float), phase)
 
 
-def planned_equations(system: NormalEquations, ground: TermInputs, terms: Iterable[ModelTerm],
+def planned_equations(plan: Plan, system: NormalEquations, terms: Iterable[ModelTerm],
                       assumed: Assumed) -> TermEquations:
     """Return the equations of terms with the readings of a plan.
 
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
     to them.
     """
+    ground = planned_ground(plan.artifact, plan.views, system, assumed)
     columns = term_columns(ground, terms)
-    reduced = reduce_columns(system.grid, columns.shapes)
     n, length = 3 * system.grid.n_views, ground.half_width_m
     inverse, ratio = np.zeros((system.size, system.size)), 0.0
     inverse[:n, :n] = system.grid_inverse
     if len(columns.lines.at):
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
         inverse = system.inverse(ratio)
-    projected = project(system, reduced, inverse, columns.lines, ratio=ratio, half_width_m=length)
-    return TermEquations(system, columns, projected, assumed.sigma_m, ratio * length**2)
+    return equations_of_columns(system, columns, inverse, ratio=ratio, half_width_m=length,
+                                noise_m=assumed.sigma_m)
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:

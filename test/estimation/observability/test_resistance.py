@@ -66,8 +66,7 @@ def test_columns_are_as_long_as_those_of_all_visits(name, size):
     """Means of marks and visits about them hold together what every visit has."""
     assumed = Assumed(SIGMA, 10e-6, 2, "serpentine@plate")
     system = planned_system(UNLIKE.artifact, UNLIKE.views)
-    ground = planned_ground(UNLIKE.artifact, UNLIKE.views, system, assumed)
-    found = planned_equations(system, ground, parse_terms([name + size], "test"), assumed)
+    found = planned_equations(UNLIKE, system, parse_terms([name + size], "test"), assumed)
     dense = dense_of(UNLIKE, assumed, Sense.MICROSCOPE_MOVES)
     columns = dense.root[:, None] * dense.columns(name, free=not size)
     assert found.norm == pytest.approx(np.linalg.norm(columns, axis=0), rel=1e-9)
