@@ -6,7 +6,7 @@ Each possible fault is undone in the recorded messages, which are collected agai
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import groupby, product
 from math import radians
 
 import numpy as np
@@ -69,10 +69,16 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int]:
     """Return the detections that would be used, and minus the faults of the offsets."""
     collector = Collector(settings)
     collector.add_command(fault.command)
+    samples = [event for event in fault.events if isinstance(event, EncoderSample)]
+    for (names, _, _), alike in groupby(samples, key=lambda sample: (
+            sample.names, len(sample.positions), len(sample.velocities))):
+        stamps, positions, velocities = zip(*(
+            (sample.stamp_ns, sample.positions, sample.velocities) for sample in alike),
+            strict=True)
+        collector.add_encoder_block(np.array(stamps), names, np.array(positions, dtype=float),
+                                    np.array(velocities, dtype=float))
     for event in fault.events:
-        if isinstance(event, EncoderSample):
-            collector.add_encoder(event)
-        else:
+        if isinstance(event, Detection):
             collector.add_detection(event)
     measurements, _ = collector.collect()
     return (sum(view.used for view in measurements.views), -len(list(wiring_faults(measurements))))
