@@ -18,8 +18,8 @@ pytest.importorskip("serial")
 KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
 
 
-@pytest.mark.parametrize("dialect", KINDS)
-@pytest.mark.parametrize("over", [over_tcp, over_pty])
+@pytest.mark.parametrize(("dialect", "over"), [
+    *((dialect, over_tcp) for dialect in KINDS), ("grbl", over_pty)])
 def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
     cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
     firmware = KINDS[dialect]()
