@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What cell_driver does with the commands of a run."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from selfcal_ros.collection.inputs import Command, Detection, Phase
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
+from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
-from test.support.cells import START_NS, Jumping, write_cell
+from selfcal_ros.machine.measuring import Run
+from test.support.cells import START_NS, Agreeing, Jumping, write_cell
 from test.support.waiting import wait_until
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture
@@ -44,3 +51,40 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
     command(Phase.MEASURE)
     seen = {(event.m, event.n) for event in driver.events if isinstance(event, Detection)}
     assert len(seen) == 9
+
+
+def exposures(events) -> list[tuple]:
+    """Return each detection without its stamp, with the position before it."""
+    found, at = [], ()
+    for event in events:
+        if isinstance(event, Detection):
+            found.append((replace(event, stamp_ns=0), at))
+        else:
+            at = event.positions
+    return found
+
+
+def test_a_class_of_ones_own_tells_the_same_without_ros_and_by_the_driver(tmp_path):
+    cell = read_cell(EXAMPLES / "cell.yaml")
+    plan = read_plan(EXAMPLES.parent / "config/plans/small.yaml")
+
+    class Listening(Run):
+        def _write(self, event):
+            super()._write(event)
+            written.append(event)
+
+    written = []
+    Listening(plan, cell, open_machine(cell), tmp_path / "bag", Agreeing(), Jumping()).measure()
+    commands = [event for event in written if isinstance(event, Command)]
+    alone = exposures(event for event in written if not isinstance(event, Command))
+
+    driver = Driver(cell, open_machine(cell), pytest.fail, Jumping())
+    try:
+        for command in commands:
+            driver.take_command(command)
+            wait_until(lambda: not driver.busy, "the end of the command")
+        driven = exposures(driver.events)
+    finally:
+        driver.close()
+    assert driven == alone
+    assert len(alone) == 264

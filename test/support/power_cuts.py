@@ -20,23 +20,9 @@ import numpy as np
 
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.topics import DETECTION_TOPIC
+from test.support.cells import PLAN, SIMULATION
 
 ROOT = Path(__file__).parents[2]
-PLAN = """
-plan_id: power_cuts
-artifact: {grid_size: 5, grid_pitch: 0.001, angular_count: 0}
-check_stops: {marks: 3, offset: 20e-6}
-views:
-  - {name: identity, repeats: 2}
-  - {name: rot90, rotation_deg: 90, repeats: 2}
-  - {name: shift, translation_pitch: [1, 0], repeats: 2}
-"""
-SIMULATION = """
-plan: plan.yaml
-seed: 3
-truth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}
-noise: {sigma_xy: 1.0e-9}
-"""
 CELL = """
 machine: surviving_stage:SurvivingStage
 SurvivingStage: {}
@@ -83,7 +69,8 @@ class Cut(NamedTuple):
 def prepare(folder: Path) -> None:
     """Write plan, machine and simulation into a new folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("plan.yaml", PLAN), ("sim.yaml", SIMULATION), ("cell.yaml", CELL),
+    for name, text in (("plan.yaml", PLAN.replace("grid_size: 3", "grid_size: 5")),
+                       ("sim.yaml", SIMULATION), ("cell.yaml", CELL),
                        ("surviving_stage.py", STAGE)):
         (folder / name).write_text(text)
 
