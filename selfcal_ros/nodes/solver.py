@@ -73,11 +73,11 @@ class Solver(ManagedNode[SolverSettings]):
 
     def _on_measurement(self, message: Any) -> None:
         self.session.take_measurement(message)
+        self._begin()  # shown when it is solved, later
         if message.image_x == message.image_y == 0:  # the rejections of all cells
             marker, view = rejected_marker(message, self.settings.frame_id), message.view_index
             if view in self._rejected or marker.action == Marker.ADD:
                 self._rejected[view] = marker
-        self._begin()
 
     def _on_command(self, message: Any) -> None:
         self.session.take_command(message)
