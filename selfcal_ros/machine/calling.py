@@ -26,7 +26,7 @@ def called(where: str, function: Callable[..., Any], *values: Any,
     Raises
     ------
     MachineError
-        For any error that is not one of this package, with the line of code that raised it.
+        For any error that is not one of this package, with the line of Python that raised it.
     """
     try:
         return function(*values, **more)
@@ -34,6 +34,7 @@ def called(where: str, function: Callable[..., Any], *values: Any,
         raise
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        raise MachineError(f"{type(error).__name__}: {first_line(error)} "
-                           f"({Path(frame.filename).name}, line {frame.lineno})", where,
+        in_python = frame.filename != __file__  # else it was raised by a library in C
+        place = f" ({Path(frame.filename).name}, line {frame.lineno})" if in_python else ""
+        raise MachineError(f"{type(error).__name__}: {first_line(error)}{place}", where,
                            remedy) from error

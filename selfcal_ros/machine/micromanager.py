@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import first_line
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.video import grey
 from selfcal_ros.units import M_PER_UM, MS_PER_S, UM_PER_M
@@ -98,13 +99,8 @@ class MicroManagerMachine:
 
     def _call(self, what: str, function: Any, *values: Any) -> Any:
         """Call the core; its errors become those of a machine."""
-        try:
-            return function(*values)
-        except MachineError:
-            raise
-        except Exception as error:  # pymmcore's CMMError, RuntimeError
-            raise MachineError(f"{what} fails ({first_line(error)})", self._where,
-                               "check the device and its cables") from error
+        return called(f"{self._where}: {what}", function, *values,
+                      remedy="check the device and its cables")
 
     def position(self) -> tuple[float, ...]:
         """Return the position read back from the stage, m."""

@@ -3,15 +3,18 @@
 
 import importlib
 import math
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import first_line
+from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.video import grey
 from selfcal_ros.units import M_PER, RAD_PER
+
+_called = partial(called, remedy="check limits, connection and the alarm of the axis")
 
 
 class OphydMachine:
@@ -112,14 +115,3 @@ def _object(name: str, timeout_s: float) -> Any:
     if hasattr(found, "wait_for_connection"):
         _called(name, found.wait_for_connection, timeout=timeout_s)
     return found
-
-
-def _called(where: str, function: Any, *values: Any, **more: Any) -> Any:
-    """Call ophyd; its errors become those of a machine."""
-    try:
-        return function(*values, **more)
-    except MachineError:
-        raise
-    except Exception as error:  # ophyd raises many kinds: LimitError, WaitTimeoutError, ...
-        raise MachineError(f"{type(error).__name__}: {first_line(error)}", where,
-                           "check limits, connection and the alarm of the axis") from error
