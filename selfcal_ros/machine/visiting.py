@@ -431,6 +431,8 @@ class Visitor:
     def first_move(self, *, marks: bool, turns: bool = False, step_m: float = 0.0) -> None:
         """Make a small move along each axis and back; check that position and marks follow.
 
+        From beyond the limits it is a move towards them, and not back.
+
         Parameters
         ----------
         marks : bool
@@ -460,7 +462,8 @@ class Visitor:
             if sees:
                 moved = dict(zip(self.axes, at.positions, strict=True))[axis] - home[axis]
                 self._check_marks(axis, moved, seen, self._seen(), self._seen())
-            self.go({axis: home[axis]})
+            if low <= at_home <= high:
+                self.go({axis: home[axis]})
 
     def _seen(self) -> list[Detection]:
         return [item for item in self.expose()[1] if item.kind == Kind.GRID]

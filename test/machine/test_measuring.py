@@ -70,6 +70,21 @@ def test_nothing_moves_beyond_the_limits(tmp_path):
     assert not spoilt.moves
 
 
+def test_a_stage_that_stands_beyond_the_limits_moves_back_towards_them(tmp_path):
+    cell, machine = write_cell(tmp_path)
+    machine._position[:2] = -0.015, 0.012
+    spoilt = Spoilt(machine)
+    run_of(tmp_path, spoilt, cell).measure()
+    x, y = np.array(spoilt.moves)[:2, :2].T
+    assert (x[0], y[1]) == pytest.approx((-0.0149, 0.0119), abs=1e-6)
+    beyond = np.abs(np.array(spoilt.moves)[2:, :2]).max()
+    assert beyond < 0.01
+    cell.require_limits("x", -0.012, "a move", start=-0.015)
+    for value, start in ((-0.016, -0.015), (0.011, -0.015), (-0.011, 0.0)):
+        with pytest.raises(MachineError, match="beyond the limits"):
+            cell.require_limits("x", value, "a move", start=start)
+
+
 def test_a_view_of_lines_needs_a_rotary_axis(tmp_path):
     cell, machine = write_cell(tmp_path, plan=PLAN.replace("angular_count: 0", "angular_count: 8"))
     spoilt = Spoilt(machine)
