@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.comparison.maps import significance, without
+from selfcal_ros.estimation.comparison.maps import Spread, significance, without
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.recheck import Significance
@@ -332,7 +332,7 @@ def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray
     total = _sum([*own, common], np.append(factors, (shares[i] - others @ shares) ** 2))
     dof = _noise_dof(runs, own, factors)
     full = all(run.correlated for run in runs) and total.ndim == 2
-    test = significance(rest, [(total if full else _diagonal(total), full)], q, dof)
+    test = significance(rest, Spread(total if full else _diagonal(total), q, dof))
     u = np.sqrt(_diagonal(total))
     e_n = np.divide(rest, coverage_factor(dof) * u, out=np.zeros_like(rest), where=u > 0)
     return Deviation(e_n, test, _p_scatter(i, values, own, others, between))

@@ -121,33 +121,13 @@ class Spread:
         return ratio / np.sqrt(rng.chisquare(self.dof, DRAWS) / self.dof)
 
 
-def significance(values: np.ndarray, covariances: list[tuple[np.ndarray, bool]],
-                 removed: np.ndarray, noise_dof: float) -> Significance | None:
-    """Test values from which the columns `removed` were removed by least squares.
-
-    Parameters
-    ----------
-    values : float array (n,)
-        The difference.
-    covariances : list
-        For both maps: covariance (n, n), or variances (n,), and whether it is a full matrix.
-    removed : float array (n, k)
-        Columns that were fitted and subtracted.
-    noise_dof : float
-        Degrees of freedom of the noise.
-
-    Returns
-    -------
-    Significance or None
-        None without uncertainties to test against.
-    """
-    correlated = all(flag for _, flag in covariances)
-    total = np.sum([covariance if correlated or covariance.ndim == 1 else np.diag(covariance)
-                    for covariance, _ in covariances], axis=0)
-    return significance_in(Spread(total, removed, noise_dof), values)
+def of_one_kind(covers: Sequence[tuple[np.ndarray, bool]]) -> list[np.ndarray]:
+    """Return covariances, or all as variances if one of them is not a full matrix."""
+    full = all(whole for _, whole in covers)
+    return [cover if full or cover.ndim == 1 else np.diag(cover) for cover, _ in covers]
 
 
-def significance_in(spread: Spread, values: np.ndarray) -> Significance | None:
+def significance(values: np.ndarray, spread: Spread) -> Significance | None:
     """Test values (n,) without columns against their noise; None if that is unknown or none."""
     covariance, dof = spread.covariance, spread.dof
     if not np.isfinite(covariance).all() or not covariance.any():
@@ -291,8 +271,8 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     rest = difference - np.tensordot(parts, modes, axes=1)
     d_theta = b.error_map.g_theta - a.error_map.g_theta
     constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
-    xy = significance(rest[:, known].ravel(), [covariance(r, known) for r in results], basis,
-                       _noise_dof(a, b, "xy"))
+    total = np.sum(of_one_kind([covariance(result, known) for result in results]), axis=0)
+    xy = significance(rest[:, known].ravel(), Spread(total, basis, _noise_dof(a, b, "xy")))
     return MapDifference(
         rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
         0.0 if keep_scale else float(parts[3]), constant,
@@ -324,8 +304,9 @@ def _theta_test(a: CalibrationResult, b: CalibrationResult, d_theta: np.ndarray,
     if known.sum() < 2:
         return None
     values = d_theta[known] - d_theta[known].mean()
-    return significance(values, [covariance(known) for covariance in covariances],
-                         np.ones((int(known.sum()), 1)), _noise_dof(a, b, "theta"))
+    total = np.sum(of_one_kind([covariance(known) for covariance in covariances]), axis=0)
+    constant = np.ones((len(values), 1))
+    return significance(values, Spread(total, constant, _noise_dof(a, b, "theta")))
 
 
 def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:

@@ -17,7 +17,9 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
 from selfcal_ros.estimation.comparison.maps import (
+    Spread,
     joint_dof,
+    of_one_kind,
     require_same_lattice,
     significance,
     without,
@@ -254,7 +256,7 @@ def _xy_maps(before: CalibrationResult, after: CalibrationResult, known: np.ndar
         here = np.concatenate([emap.gx[known], emap.gy[known]])
         values.append(here - q @ (q.T @ here))
         covers.append(xy_covariance(result, known))
-    return _Maps(values[0], values[1], *_of_one_kind(covers, q), q)
+    return _Maps(values[0], values[1], *_without_datum(covers, q), q)
 
 
 def _theta_maps(before: CalibrationResult, after: CalibrationResult, known: np.ndarray) -> _Maps:
@@ -263,23 +265,21 @@ def _theta_maps(before: CalibrationResult, after: CalibrationResult, known: np.n
     values = [result.error_map.g_theta[known] for result in (before, after)]
     covers = [theta_covariance(result, known) for result in (before, after)]
     one, other = (each - each.mean() for each in values)
-    return _Maps(one, other, *_of_one_kind(covers, q), q)
+    return _Maps(one, other, *_without_datum(covers, q), q)
 
 
-def _of_one_kind(covers: list[tuple[np.ndarray, bool]],
+def _without_datum(covers: list[tuple[np.ndarray, bool]],
                  q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two covariances without the datum's part, as matrices, or both as variances."""
-    full = all(whole for _, whole in covers)
-    one, other = (without(each if full or each.ndim == 1 else np.diag(each), q)
-                  for each, _ in covers)
+    one, other = (without(cover, q) for cover in of_one_kind(covers))
     return one, other
 
 
 def _remaining(maps: _Maps, *dof: float) -> Significance | None:
     """Return the test of the error with the correction on, with the covariance of both maps."""
     sizes = (_trace(maps.cover_before), _trace(maps.cover_after))
-    return significance(maps.after, [(maps.cover, maps.cover.ndim == 2)], maps.datum,
-                        joint_dof(*zip(sizes, dof, strict=True)))
+    return significance(maps.after, Spread(maps.cover, maps.datum,
+                                           joint_dof(*zip(sizes, dof, strict=True))))
 
 
 def _is_clear(test: Significance | None) -> bool:

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.comparison.maps import (
     PITCH_TOLERANCE,
     Spread,
     joint_dof,
-    significance_in,
+    significance,
 )
 from selfcal_ros.estimation.recheck.detection import ChangeTests
 from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
@@ -94,7 +94,7 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[:artifact.m.size]]
     tests = ChangeTests(covariance, basis, dof, z)
     in_datum = tests.without(values)
-    test = significance_in(tests, in_datum)
+    test = significance(in_datum, tests)
     row = scale_row(modes)
     scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
 
@@ -143,7 +143,7 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
     spread = Spread(of_new + of_old, np.ones((len(values), 1)), dof)
     values = values - values.mean()
     out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
-    test = significance_in(spread, values)
+    test = significance(values, spread)
     return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
 
 
