@@ -76,8 +76,9 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     InputError
         If less than three nodes are known in both maps.
     """
-    old, (rows, sites, there) = plate.result.error_map, _on_nodes(artifact, plate)
-    common = new.known & np.tile(there.ravel(), 2)
+    old, sites = plate.result.error_map, plate.together.sites
+    rows, known_before = _on_nodes(artifact, plate)
+    common = new.known & np.tile(known_before, 2)
     if common.sum() < 6:
         raise InputError(plate.where, f"only {common.sum() // 2} nodes are known in both maps",
                          "measure where its map is known")
@@ -133,7 +134,7 @@ def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray,
 def line_change(new: NewMap, plate: KnownPlate) -> Change:
     """Return the change of the angular map since the calibration of the plate."""
     old, count = plate.result.error_map.g_theta, len(new.known)
-    common = plate.kept.lines()[0][0] & new.known
+    common = plate.together.lines()[0][0] & new.known
     out = np.full((2, count), np.nan)
     if common.sum() < 2:
         return Change(out[0], out[1], None)
@@ -153,17 +154,16 @@ def scale_row(modes: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(modes / size)[3] / size[3]
 
 
-def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows from known nodes of the old map to those of another, and where it is known.
 
-    Rows (n, s), the nodes used, bool (ox, oy), and nodes of the other map, bool (nx, ny).
+    Rows (n, s), and nodes of the other map, bool (n,).
     """
-    kept, old = plate.kept.sites, plate.result.artifact
+    known, old = plate.together.sites.ravel(), plate.result.artifact
     if artifact.shape == old.shape and abs(
             artifact.grid_pitch_m / old.grid_pitch_m - 1) < PITCH_TOLERANCE:
-        return np.eye(kept.size)[:, kept.ravel()], kept, kept
-    rows, kept, inside = rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
-    return rows, kept, inside.reshape(artifact.shape)
+        return np.eye(len(known))[:, known], known
+    return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
 
 def recheck_found(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate, *,
@@ -186,7 +186,7 @@ def recheck_found(change: Change, lines: Change, artifact: Artifact, plate: Know
         rms(change.values), rms(change.u), p_xy=change.p, significance_xy=change.test, scale=scale,
         dx=dx, dy=dy, u_dx=u_dx, u_dy=u_dy, passes=passes)
     if change.tests is not None:
-        found = replace(found, detectable=change.tests.found(DIFFERENCE_LEVEL / len(tested)))
+        found = replace(found, detectable=change.tests.detectable(DIFFERENCE_LEVEL / len(tested)))
     if lines.test is None:
         return found
     line, = lines.worst

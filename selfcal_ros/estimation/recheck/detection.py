@@ -47,9 +47,9 @@ class ChangeTests(Spread):
         z = self.places / np.abs(self.places).max()
         columns = np.stack([z.real**i * z.imag**j for i in range(ORDER + 1)
                             for j in range(ORDER + 1 - i)], axis=1)
-        found, size, _ = np.linalg.svd(self.without(np.kron(np.eye(2), columns)),
+        basis, size, _ = np.linalg.svd(self.without(np.kron(np.eye(2), columns)),
                                        full_matrices=False)
-        return found[:, size > np.sqrt(NO_VARIANCE) * size[0]]
+        return basis[:, size > np.sqrt(NO_VARIANCE) * size[0]]
 
     @cached_property
     def _whiten_smooth(self) -> np.ndarray:
@@ -75,28 +75,29 @@ class ChangeTests(Spread):
     @cached_property
     def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics of noise, each in order, (3, DRAWS), and the least rank from above, sorted."""
-        found = self.of(self._noise)
-        ranks = DRAWS - np.argsort(np.argsort(found, axis=1), axis=1)
-        return np.sort(found, axis=1), np.sort(ranks.min(axis=0))
+        statistics = self.of(self._noise)
+        ranks = DRAWS - np.argsort(np.argsort(statistics, axis=1), axis=1)
+        return np.sort(statistics, axis=1), np.sort(ranks.min(axis=0))
 
     def p(self, values: np.ndarray) -> float:
         """Return the probability of as significant a change, (2n,), if there is none."""
-        found, (drawn, least) = self.of(values[:, None])[:, 0], self._ranked
-        rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
-                   for row, one in zip(drawn, found, strict=True))
+        statistics, (drawn, least) = self.of(values[:, None])[:, 0], self._ranked
+        rank = min(DRAWS - int(np.searchsorted(row, statistic)) + 1
+                   for row, statistic in zip(drawn, statistics, strict=True))
         p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
-        return float(p) if p > TAIL else min(float(p), self._bound(values, found))
+        return float(p) if p > TAIL else min(float(p), self._bound(values, statistics))
 
-    def _bound(self, values: np.ndarray, found: np.ndarray) -> float:
+    def _bound(self, values: np.ndarray, statistics: np.ndarray) -> float:
         """Return a bound of the probability, close where it is small (Bonferroni)."""
         dof, n = min(self.dof, MANY_DOF), len(self.u)
         each = [2 * n * float(stdtr(dof, -np.abs(values / self.u).max()))]
-        for square, free in ((found[0], self.rank), (found[2], self._smooth.shape[1])):
+        for square, free in ((statistics[0], self.rank),
+                             (statistics[2], self._smooth.shape[1])):
             each.append(float(fdtrc(free, dof, square / free) if self.dof <= MANY_DOF
                               else chdtrc(free, square)))
         return min(3 * min(each), 1.0)
 
-    def found(self, level: float) -> Detectable:
+    def detectable(self, level: float) -> Detectable:
         """Return the changes of which POWER are found if the tests have a level.
 
         At one node, any node and direction; and a smooth one, any polynomial.

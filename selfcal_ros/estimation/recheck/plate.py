@@ -28,7 +28,7 @@ class KnownPlate:
     ----------
     result : CalibrationResult
         The calibration that made it known.
-    kept : Together
+    together : Together
         What it knows of stage and plate together.
     where : str
         Its file, for messages.
@@ -38,7 +38,7 @@ class KnownPlate:
     """
 
     result: CalibrationResult
-    kept: Together
+    together: Together
     where: str
     reference: dict[str, Any] | None = None
 
@@ -53,7 +53,7 @@ class KnownPlate:
         if self.reference is not None and self.result.reference is not None:
             longer = self.reference["relative_error"] - self.result.reference["relative_error"]
         nominal = lattice.x_m + 1j * lattice.y_m
-        return np.where(self.kept.marks, plate.ax + 1j * plate.ay + longer * nominal,
+        return np.where(self.together.marks, plate.ax + 1j * plate.ay + longer * nominal,
                         complex(np.nan, np.nan))
 
     @property
@@ -116,22 +116,22 @@ def reference_now(result: CalibrationResult, where: str, at: str) -> dict[str, A
     """
     if not at:
         return None
-    found = result.reference or {}
-    known = found.get("certified")
-    if not known or not ReferenceKind(found["kind"]).of_plate:
+    reference = result.reference or {}
+    certified = reference.get("certified")
+    if not certified or not ReferenceKind(reference["kind"]).of_plate:
         raise InputError("--reference-at", f"{where} has no reference length of its plate with the "
                          "temperature of the calibration", "leave it out: the map then has no "
                          "scale; or calibrate with --reference and --reference-at")
-    certified = ReferenceLength(found["kind"], known["relative_error"], known["u_relative"],
-                                found.get("certificate") or "", marks=found.get("marks"))
-    moved = certified.at_temperature(at)
-    assert moved.certified is not None
+    length = ReferenceLength(
+        reference["kind"], certified["relative_error"], certified["u_relative"],
+        reference.get("certificate") or "", marks=reference.get("marks")).at_temperature(at)
+    assert length.certified is not None
     for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
-        if not np.isclose(moved.certified[name], known[name], rtol=1e-9, atol=0.0):
-            raise InputError("--reference-at", f"{name} is {moved.certified[name]:g}, and "
-                             f"{known[name]:g} in {where}", "change the temperature alone")
-    return {**found, "relative_error": moved.relative_error, "u_relative": moved.u_relative,
-            "certified": moved.certified}
+        if not np.isclose(length.certified[name], certified[name], rtol=1e-9, atol=0.0):
+            raise InputError("--reference-at", f"{name} is {length.certified[name]:g}, and "
+                             f"{certified[name]:g} in {where}", "change the temperature alone")
+    return {**reference, "relative_error": length.relative_error,
+            "u_relative": length.u_relative, "certified": length.certified}
 
 
 def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPlate:
@@ -158,12 +158,12 @@ def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPla
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(where, "is not qualified, so its plate is not known",
                          "calibrate again")
-    kept = together(result)
-    if kept is None:
+    covariances = together(result)
+    if covariances is None:
         raise InputError(where, "does not contain the covariance of its plate",
                          "calibrate with the method joint and with uncertainty; a plate may have "
                          "31 x 31 marks at most")
-    return KnownPlate(result, kept, where, reference_now(result, where, at))
+    return KnownPlate(result, covariances, where, reference_now(result, where, at))
 
 
 def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
@@ -178,7 +178,7 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     if (mine.shape, mine.angular_count, mine.marks) != (
             other.shape, other.angular_count, other.marks) or abs(
             mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
-        raise InputError(plate.where, f"its plate has {_said(other)}, not {_said(mine)}",
+        raise InputError(plate.where, f"its plate has {_described(other)}, not {_described(mine)}",
                          "name the calibration of that plate")
     if mine.map_grid is None and other.map_grid is not None:
         mine = replace(mine, map_grid=other.map_grid)
@@ -187,7 +187,7 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     return replace(measurements, artifact=mine)
 
 
-def _said(artifact: Artifact) -> str:
+def _described(artifact: Artifact) -> str:
     nx, ny = artifact.shape
     if artifact.marks:
         return f"a list of {nx} marks and {artifact.angular_count or 'no'} lines"
@@ -195,17 +195,17 @@ def _said(artifact: Artifact) -> str:
             f"{artifact.angular_count or 'no'} lines")
 
 
-def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows from known nodes of the old map to places, complex (P,), m.
 
-    Rows (P, s), the nodes used, bool (ox, oy), and the places where it is known, bool (P,).
+    Rows (P, s), and the places where it is known, bool (P,).
     """
-    kept, old, grid = plate.kept.sites, plate.result.artifact, plate.result.plate.map_grid
+    known, old, grid = plate.together.sites, plate.result.artifact, plate.result.plate.map_grid
     how = Interpolation.BICUBIC if grid is None else grid.interpolation
-    spline, n = MapSpline.of(old, how if kept.all() else Interpolation.BILINEAR), kept.size
-    unit = spline.coefficients(np.eye(n).reshape(n, *kept.shape)).reshape(n, n).T
+    spline, n = MapSpline.of(old, how if known.all() else Interpolation.BILINEAR), known.size
+    unit = spline.coefficients(np.eye(n).reshape(n, *known.shape)).reshape(n, n).T
     rows = spline.rows(places) @ unit
-    inside = np.abs(rows[:, ~kept.ravel()]).sum(axis=1) < EDGE
+    inside = np.abs(rows[:, ~known.ravel()]).sum(axis=1) < EDGE
     reach = (np.array(old.half) + EDGE) * old.grid_pitch_m
     inside &= (np.abs(places.real) <= reach[0]) & (np.abs(places.imag) <= reach[1])
-    return rows[:, kept.ravel()], kept, inside
+    return rows[:, known.ravel()], inside

@@ -138,8 +138,8 @@ def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
         return None
     at, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
     sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
-    rows, sites, there = rows_at(sign * at, plate)
-    stage = sign * (rows @ (old.gx + 1j * old.gy)[sites])
+    rows, there = rows_at(sign * at, plate)
+    stage = sign * (rows @ (old.gx + 1j * old.gy)[plate.together.sites])
     marks = plate.result.artifact_map
     u = [sigma / np.sqrt(view.count.mean()), rms(np.stack([old.u_gx, old.u_gy])),
          rms(np.stack([marks.u_ax, marks.u_ay])), LEAST * rms(np.stack([marks.ax, marks.ay]))]

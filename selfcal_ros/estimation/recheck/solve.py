@@ -202,7 +202,7 @@ def plate_readings(measurements: Measurements, options: Options,
                    plate: KnownPlate) -> PlateReadings:
     """Return the readings of known marks, and the terms of the model."""
     grid, angular = grid_data(measurements), angular_data(measurements)
-    grid = replace(grid, weight=np.where(plate.kept.marks, grid.weight, 0.0))
+    grid = replace(grid, weight=np.where(plate.together.marks, grid.weight, 0.0))
     if not grid.weight.any():
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
@@ -248,11 +248,11 @@ def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, N
     for kind, repeats, declared in (
             ("xy", of_marks, of_mark),
             ("theta", problem.repeats_theta, problem.angular.sigma_declared)):
-        found = noise_estimate(repeats, (nan, 0), declared)
-        if not (found.sigma > 0 and found.dof >= MIN_REPEAT_DOF):
-            found = replace(found, sigma=getattr(before, f"sigma_{kind}"),
+        noise = noise_estimate(repeats, (nan, 0), declared)
+        if not (noise.sigma > 0 and noise.dof >= MIN_REPEAT_DOF):
+            noise = replace(noise, sigma=getattr(before, f"sigma_{kind}"),
                             dof=getattr(before, f"dof_{kind}"))
-        out.append(found)
+        out.append(noise)
     return out[0], out[1]
 
 
@@ -266,8 +266,8 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
     of_offsets = readings.of_offsets() * calibrated
     of_plate = np.hstack([readings.of_marks(), stacked(of_offsets)])
     noise = _noise_of_marks(readings, plate, xy.sigma, stacked(terms))
-    sites, marks = plate.kept.sites, readings.marks
-    before = plate.kept.cover(sites, marks)
+    sites, marks = plate.together.sites, readings.marks
+    before = plate.together.cover(sites, marks)
     of_marks = before[2 * sites.sum():, 2 * sites.sum():]
     solution = plate_solution(
         readings, noise.covariance + of_plate @ of_marks @ of_plate.T,
@@ -299,7 +299,7 @@ def _noise_of_marks(readings: PlateReadings, plate: KnownPlate, sigma: float,
 def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
     angular, count = readings.problem.angular, readings.measurements.artifact.angular_count
-    (_, known), before = plate.kept.lines()
+    (_, known), before = plate.together.lines()
     weight = np.where(known, angular.weight, 0.0)
     view, line = np.nonzero(weight)
     of_plate = (line[:, None] == np.arange(count)).astype(float)
@@ -315,8 +315,9 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
     if readings.measurements.sense is Sense.PLATE_MOVES:
         back = -np.arange(count) % max(count, 1)
         values, rows = -values[back], -rows[back]
-    told = rows.any(axis=1)
-    return NewMap(told, values[told], rows[told], noise, of_plate, before, theta.dof)
+    determined = rows.any(axis=1)
+    return NewMap(determined, values[determined], rows[determined], noise, of_plate, before,
+                  theta.dof)
 
 
 def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:

@@ -44,7 +44,7 @@ def test_the_level_is_the_nominal_one(dof):
 @pytest.mark.parametrize("level", [0.05, 0.025])
 def test_nine_of_ten_changes_of_the_stated_size_are_found(kind, level):
     tests, rng, n = change_tests(np.inf), np.random.default_rng(6), PLATE.m.size
-    size, shape = getattr(tests.found(level), kind), np.zeros((2, n, DRAWS))
+    size, shape = getattr(tests.detectable(level), kind), np.zeros((2, n, DRAWS))
     if kind == "one_node":
         at, turn = rng.integers(n, size=DRAWS), rng.uniform(0, 2 * np.pi, DRAWS)
         shape[:, at, np.arange(DRAWS)] = np.cos(turn), np.sin(turn)

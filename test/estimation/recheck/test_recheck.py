@@ -243,7 +243,7 @@ def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
     kept = [replace(subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)),
                     visits=None) for view in before.views]
     plate = known_plate(saved(calibrate(replace(before, views=tuple(kept)), linear())), "r.json")
-    assert plate.kept.marks.sum() == 24
+    assert plate.together.marks.sum() == 24
     plan, rng = Plan("again", before.artifact, (again,)), np.random.default_rng(6)
     truth = random_truth(plan.artifact, 1, rng, Spread(phi_rad=1e-5))
     after = simulate_measurements(truth, plan, rng, visits=True, settings=CellSettings(
