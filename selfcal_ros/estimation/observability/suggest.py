@@ -63,6 +63,7 @@ class Score:
     """Predicted uncertainty of a plan for unit noise of one reading; infinite if deficient.
 
     `of_terms`: the deficiency is caused by free terms; without them the stage is identified.
+    `unknown_sites`: outermost nodes of a map that it leaves unknown: no uncertainty counts them.
     """
 
     deficiency: int
@@ -70,17 +71,18 @@ class Score:
     max_xy: float
     rms_theta: float
     of_terms: bool = False
+    unknown_sites: int = 0
 
     def key(self, criterion: str) -> tuple[float, ...]:
-        """Return the order of plans: deficiency first, then the criterion, then the other.
+        """Return the order of plans: deficiency, unknown nodes, the criterion, then the other.
 
         For a plan deficient even without terms, their effect is not counted: it comes last.
         """
         first, second = ((self.rms_xy, self.max_xy) if criterion == "rms"
                          else (self.max_xy, self.rms_xy))
         # rounding must not decide between plans equal by symmetry
-        return (bool(self.deficiency and not self.of_terms), self.deficiency, round(first, 9),
-                round(second, 9), round(self.rms_theta, 9))
+        return (bool(self.deficiency and not self.of_terms), self.deficiency, self.unknown_sites,
+                round(first, 9), round(second, 9), round(self.rms_theta, 9))
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,13 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
     The XY uncertainty includes the contribution of the terms of `against`.
     """
     system = planned_system(plan.artifact, plan.views)
+    unknown_sites = 0
     if plan.artifact.map_grid is None:
         unseen = deficiency(system)
-    else:  # outermost nodes may stay unknown
+    else:
         seen = full_observability(system, plan.artifact, plan.views)
         unseen = 0 if seen.identifiable else max(seen.deficiency, 1)
+        unknown_sites = int((~system.known_sites).sum())
     if unseen:
         return Score(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
@@ -165,7 +169,7 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
             return Score(hidden, inf, inf, inf, of_terms=True)
         found = with_part_of_terms(found, terms, repeats)
     theta = found.rms_theta if len(found.u_theta) else 0.0
-    return Score(0, found.rms_xy, found.max_xy, theta)
+    return Score(0, found.rms_xy, found.max_xy, theta, unknown_sites=unknown_sites)
 
 
 @one_thread()
