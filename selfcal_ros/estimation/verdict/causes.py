@@ -11,7 +11,7 @@ from scipy.special import fdtrc
 
 from selfcal_ros.blocks import Located, block_of, blocks
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.joint.problem import FLOOR, Problem, pooled
+from selfcal_ros.estimation.joint.problem import FLOOR, LEAST_PART, pooled
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL, Explanation
@@ -157,29 +157,31 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     return replace(cause_of(held, model.problem.ground), p=p)
 
 
-def line_cause(problem: Problem, measurements: Measurements, level: float) -> Cause | None:
+def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cause | None:
     """Return the reading of a line that contradicts the others most; None if none does.
 
     Lines are fitted without marks. The error of a reading is its residual over 1 - h, the part that
     the fit does not follow; the reduction of the sum of squares is tested against the remainder
-    (F-test; the level is that of all lines together).
+    (F-test; the level is that of all lines together). Lines are tested against no less noise than
+    that with which they are weighted.
 
     Parameters
     ----------
-    problem : Problem
-        Plan and readings.
+    model : ModelFit
+        The fit of marks and lines.
     measurements : Measurements
         Readings, for the names of the views.
     level : float
         Level of the test.
     """
-    worst = min(_suspects(problem, measurements), key=lambda line: line.p, default=None)
+    worst = min(_suspects(model, measurements), key=lambda line: line.p, default=None)
     return worst if worst is not None and worst.p < level else None
 
 
-def _suspects(problem: Problem, measurements: Measurements) -> Iterator[Cause]:
+def _suspects(model: ModelFit, measurements: Measurements) -> Iterator[Cause]:
     """Yield the readings of lines with the largest residuals, each tested."""
-    system, angular = problem.system, problem.system.angular
+    problem, system, angular = model.problem, model.problem.system, model.problem.system.angular
+    least = LEAST_PART * model.found.xy.sigma / problem.half_width_m
     dof = angular.n_readings - system.rank_angular
     if dof < 2:
         return
@@ -197,6 +199,7 @@ def _suspects(problem: Problem, measurements: Measurements) -> Iterator[Cause]:
         variance = max(float(squares.sum()) - gained, 0.0) / (dof - 1)
         if variance <= FLOOR**2:
             continue
+        variance = max(variance, least**2)
         p = float(fdtrc(1, dof - 1, gained / variance)) * angular.n_readings
         yield Cause(READING, off, float(np.sqrt(variance / (weight * left))), "rad", min(p, 1.0),
                     measurements.views[problem.angular.index[v]].view.name, mark=(k,))

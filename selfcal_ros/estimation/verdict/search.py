@@ -243,7 +243,7 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
         failed = False
     for item in left:
         _bound(found, item, measurements)
-    if (line := line_cause(_model(found.solved).problem, measurements, CAUSE_LEVEL)) is not None:
+    if (line := line_cause(_model(found.solved), measurements, CAUSE_LEVEL)) is not None:
         found.causes.append(line)
         lines = measurements.artifact.angular_count  # the error of a reading at most
         found.effects.append(Effect(
