@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.turned import (
@@ -99,7 +100,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     solved = judged(solved, measurements, options)
     result = solved.result
     if joint and converged and not _agree(result):
-        _check_turned(measurements, options, contradicted=bool(result.verdict.failed))
+        _check_turned(measurements, options, contradicted=not _fits(result))
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
     shown = {} if camera is None else camera.to_dict()
@@ -147,11 +148,20 @@ def _agree(result: CalibrationResult) -> bool:
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
+def _fits(result: CalibrationResult) -> bool:
+    """Return whether nothing contradicts the wiring: no test failed, and lines turn as marks do.
+
+    An effect beyond U leaves a result unqualified, and contradicts no wiring.
+    """
+    causes = result.verdict.causes
+    return not result.verdict.failed and not any(
+        cause.name in blocks() and block_of(cause.name).between for cause in causes)
+
+
 def _check_turned(measurements: Measurements, options: Options, *, contradicted: bool) -> None:
     """Raise WiringError if the readings agree with another wiring of the offsets.
 
-    `contradicted`: whether a test failed with the wiring as it is. An effect beyond U leaves a
-    result unqualified, and contradicts no wiring.
+    `contradicted`: whether the readings contradict the wiring as it is.
     """
     if not shows_offsets(measurements):
         return
@@ -169,8 +179,7 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
         if (found := solution(wiring)) is None:
             return False
         result = judged(*found, options, advise=False).result
-        explained = contradicted and options.finite_rotations and not result.verdict.failed
-        return _agree(result) or explained
+        return _agree(result) or (contradicted and options.finite_rotations and _fits(result))
 
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks

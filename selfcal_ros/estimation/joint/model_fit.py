@@ -44,8 +44,8 @@ ROUGH_RESOLUTION = 1e-11
 """The same once steps no longer shrink."""
 
 OF_NOISE = 1e-3
-"""Change of a reading, against the standard uncertainty of a misalignment, that is none once steps
-no longer shrink: rounding moves it where weights lie far apart, or a term is hardly told."""
+"""Change, against its standard uncertainty, that is none once steps no longer shrink: rounding
+moves misalignments where weights lie far apart, or a term is hardly told."""
 
 LATE, OF_NOISE_LATE = 20, 0.1
 """Steps after which rounding is all that moves, and the change that is none from then on: plates
@@ -156,7 +156,7 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         stuck = number > 2 and change > SHRINKS * before
         part = OF_NOISE if number < LATE else OF_NOISE_LATE
         if stuck and (change <= max(ROUGH_RESOLUTION * largest, FLOOR)
-                      or state.within_noise(change, part)):
+                      or state.within_noise(part)):
             return state.finished()
         if change > DIVERGES * peak:
             break
@@ -189,6 +189,7 @@ class _State:
         self.y = problem.grid.y
         self.found = fit(problem, self.y, self.theta)
         self.offset_steps = OFFSET_STEPS
+        self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
         self.of_offsets = next((term for term in problem.terms
@@ -259,16 +260,25 @@ class _State:
         self.y = np.where(self.problem.system.grid.read, self.problem.grid.y - self._excess()
                           - self._of_terms() - taken, 0.0)
         self.found = fit(self.problem, self.y, self.theta)
-        least = min(np.abs(self.found.parameters - parameters).max(), np.abs(self.y - y).max())
-        return float(max(least, self.moving.change))
+        self.moved_m = np.abs(self.found.parameters - parameters)
+        self.changed_m = float(np.abs(self.y - y).max())
+        return max(min(float(self.moved_m.max()), self.changed_m), self.moving.change)
 
-    def within_noise(self, change: float, part: float) -> bool:
-        """Return whether a change of the misalignments is below a part of their uncertainty."""
+    def within_noise(self, part: float) -> bool:
+        """Return whether the last step was below a part of what the noise makes of it.
+
+        Of a misalignment that the readings alone determine that is its standard uncertainty; of one
+        that the datum fixes, and of a reading, that of the mean of all readings of a view.
+        """
+        sigma, weight = self.found.xy.sigma, self.problem.grid.weight
+        if not np.isfinite(sigma):
+            return False
+        of_view = sigma / np.sqrt(weight.reshape(len(weight), -1).sum(axis=1).max())
         spread = np.diag(self.found.inverse)
-        spread = spread[spread > FIXED * spread.max(initial=0.0)]
-        sigma = self.found.xy.sigma
-        return bool(len(spread) and np.isfinite(sigma)
-                    and change <= part * sigma * np.sqrt(spread.min()))
+        told = spread > FIXED * spread.max(initial=0.0)
+        noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
+        still = bool((self.moved_m <= part * noise).all()) or self.changed_m <= part * of_view
+        return still and self.moving.change <= part * of_view
 
     def finished(self) -> ModelFit:
         equations, reduced = self.equations, self.reduced

@@ -391,10 +391,11 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
         `TermEquations.inverse` of it.
     """
     right = equations.unbiased_sums(found.total)
-    everything = np.ones(equations.n, dtype=bool)
-    hidden = equations.untold(everything, UNTOLD) / equations.norm[:, None]
-    if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
-        right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
+    if sigma_m <= LEAST_NOISE_M:  # the sizes weigh next to nothing
+        everything = np.ones(equations.n, dtype=bool)
+        hidden = equations.untold(everything, UNTOLD) / equations.norm[:, None]
+        if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
+            right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
     prior = equations.prior(sigma_m)
     return coefficients + inverse @ (right - prior * coefficients)
 

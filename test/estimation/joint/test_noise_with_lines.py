@@ -4,9 +4,11 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -41,3 +43,19 @@ def test_the_noise_of_very_few_marks_is_that_of_lines_as_well():
         result = calibrated(1, Artifact(3, 0.01, lines), 1)
         assert result.noise.dof_xy_residuals > 10 and result.verdict.grade is Grade.GOOD
         assert 0.5 < result.noise.sigma_xy_residuals / NOISE < 3
+
+
+@pytest.mark.parametrize("phi_rad", [1e-6, 1e-5, 1e-4])
+def test_lines_without_noise_neither_stop_the_fit_nor_contradict_anything(phi_rad):
+    """Plates that lie almost straight hardly show the microscope's scale."""
+    plate, exact = Artifact(11, 0.01, 24), CellSettings(
+        sigma_xy_m=20e-9, sigma_theta_rad=0.0, servo_sigma_m=20e-9, servo_sigma_theta_rad=1e-7)
+    for seed in range(4):
+        plan, rng = hu_plan(plate, 3), np.random.default_rng(seed)
+        truth = random_truth(plate, 4, rng, Spread(rotation="finite", phi_rad=phi_rad))
+        result = calibrate(simulate_measurements(truth, plan, rng, settings=exact, visits=True))
+        assert result.verdict.failed == () and result.verdict.causes == ()
+        error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
+        error = remove_modes(error, datum_modes(plate, scale=True))
+        inside = abs(error) < 2 * np.stack([result.error_map.u_gx, result.error_map.u_gy])
+        assert inside.mean() > 0.9
