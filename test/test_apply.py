@@ -204,7 +204,7 @@ def test_the_example_runs(file, capsys, monkeypatch):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 6 and lines[3] in [f"and back: off by at most {e} m" for e in (
-        "0e+00", "2e-18", "3e-18", "4e-18")]
+        "0e+00", "2e-18", "3e-18", "4e-18", "5e-18")]
     assert lines[4].startswith("distance 0.025000 m is indicated ")
     assert lines[5].startswith("mean error in x ")
 

@@ -81,8 +81,9 @@ class Machine:
         mark, phase = (m + 1j * n) * PITCH_M, view.pose.phase
         spline = MapSpline.of(artifact.field, Interpolation.BICUBIC if artifact.map_grid
                               else Interpolation.BILINEAR)
-        x, y = mark.real / np.abs(mark.real).max(), mark.imag / np.abs(mark.imag).max()
-        bent = np.stack([x**2, 2 * x * y, y**2], axis=-1) @ complex_normal(rng, (3,), BEND_M)
+        z = mark / np.abs(mark.real).max()
+        bent = np.stack([z**2, abs(z) ** 2, z.conj() ** 2], axis=-1) @ complex_normal(
+            rng, (3,), BEND_M)
         seen = phase * np.exp(1j * phi) * (mark + self.plate[inside] + bent) - phase * mark
         seen += spline.rows(view.pose.places(artifact, m, n)) @ spline.coefficients(
             self.field).ravel()

@@ -52,7 +52,7 @@ BAGS = {
     # Hu's views, marks without names, stops on them, each reached from one side, other axes
     "hu": (VIEWS[:3], 2, "raster", {"encoder": "independent", "phi": 1e-5, "t": 3e-6},
            {"with_ids": False}, {})}
-GAIN = {"gx": 4.0, "gy": 4.0, "g_theta": 1.0}
+GAIN = {"gx": 6.0, "gy": 6.0, "g_theta": 1.0}
 """Largest standard uncertainty over the noise of one reading, whatever terms are in the model."""
 
 

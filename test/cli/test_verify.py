@@ -44,7 +44,7 @@ def verified(folder, capsys, name, times, views, *more):
 
 @pytest.mark.parametrize(("views", "times", "fault", "code"), [
     (VIEWS, -1, "sign", 5), (VIEWS, 25.4, "factor", 5), (VIEWS[:1], 1, "none", 0),
-    (VIEWS[:1], -1, "sign", 5), (VIEWS[:1], 0, "off", 5), (VIEWS[:1], 0.5, "factor", 5)])
+    (VIEWS[:1], -1, "sign", 5), (VIEWS[:1], 0, "off", 5), (VIEWS[:1], 0.4, "factor", 5)])
 def test_what_acts_is_named(folder, capsys, views, times, fault, code):
     name = f"act_{times}_{len(views)}"
     found_code, found = verified(folder, capsys, name, times, views)

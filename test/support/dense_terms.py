@@ -109,11 +109,14 @@ class Dense:
             x, y = np.array([place for _, place, *_ in self.about]).T
             turns = np.array([turn for _, _, turn, *_ in self.about])
             scale = np.stack([x, y]) * self.half
+            saddle, twice, round_ = x * x - y * y, 2 * x * y, x * x + y * y
             shapes = {
                 "plate_scale": [scale],
                 "plate_strain": [scale, scale * [[1], [-1]], scale[::-1]],
-                "plate_shape": [np.outer(d, q) for d in ((1, 0), (0, 1))
-                                       for q in (x * x, 2 * x * y, y * y)]}[name]
+                "plate_shape": [
+                    np.stack(each) for each in (
+                        (saddle, twice), (-twice, saddle), (round_, 0 * x), (0 * x, round_),
+                        (saddle, -twice), (twice, saddle))]}[name]
             out = [np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
                    for v in views[int(free):] for shape in shapes]
         return np.array(out).reshape(len(out), -1).T

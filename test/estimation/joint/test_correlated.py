@@ -63,13 +63,14 @@ def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlat
 
 
 def test_slow_noise_is_in_the_uncertainty(monkeypatch):
+    flat = Options(terms=parse_terms(["plate_shape:0"], ""))
     inside, unaware = [], []
     for seed in range(4):
         truth, readings = measured(11, seed, slow_m=20e-9)
-        inside.append(covered(calibrate(readings), truth.g))
+        inside.append(covered(calibrate(readings, flat), truth.g))
         with monkeypatch.context() as patch:
             patch.setattr(solve, "MAX_SITES", 0)
-            unaware.append(covered(calibrate(readings), truth.g))
+            unaware.append(covered(calibrate(readings, flat), truth.g))
     assert np.mean(inside) > max(0.93, np.mean(unaware) + 0.01)
 
 

@@ -14,6 +14,7 @@ from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.standards.statements import is_traceable, scale_texts
 from test.support.lattice_plans import plan_of
@@ -51,7 +52,7 @@ def session(seed, warmer, *, told=True, sense=Sense.MICROSCOPE_MOVES):
     view = replace(PLAN, plan_id="again", views=PLAN.views[:1])
     plate = known_plate(before, "before.json", shown(20.4 + warmer) if told else "")
     again = simulate_measurements(warm, view, rng, sigma_m=2e-8, sense=sense)
-    return recheck(again, Options(), plate), truth
+    return recheck(again, Options(terms=parse_terms(["plate_shape:0"], "")), plate), truth
 
 
 @pytest.mark.parametrize("sense", list(Sense))

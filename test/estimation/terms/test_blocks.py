@@ -79,7 +79,7 @@ def test_it_is_found_sized_and_said(sagging, capsys):
     _, result, shown = solved(sagging, capsys)
     cause = result["verdict"]["causes"][0]
     assert cause["name"] == "stage_sag" and cause["unit"] == "m/m"
-    assert abs(cause["size"] - SAG) < 4 * cause["u"] < 0.15 * SAG  # bending of 5 nm
+    assert abs(cause["size"] - SAG) < 4 * cause["u"] < 0.2 * SAG  # bending of 5 nm
     text = " ".join(shown.split())
     assert re.search(r"a stage that sags under a plate off its centre, by [78]\.\d\d ± \d\.\d\d "
                      "µm a metre", text)
@@ -92,7 +92,7 @@ def test_it_is_a_term_of_the_model(sagging, capsys, size):
     code, result, shown = solved(sagging, capsys, "--model", f"stage_sag{size}", "--budget")
     term = next(term for term in result["model"]["terms"] if term["name"] == "stage_sag")
     [estimate] = term["estimates"]
-    assert abs(estimate["value"] - SAG) < 4 * estimate["u"] < 0.15 * SAG  # bending of 5 nm
+    assert abs(estimate["value"] - SAG) < 4 * estimate["u"] < 0.2 * SAG  # bending of 5 nm
     assert code == 0 and "stage_sag" not in [c["name"] for c in result["verdict"]["causes"]]
     assert ("term stage_sag" in shown) == bool(size)
 

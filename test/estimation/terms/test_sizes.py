@@ -35,9 +35,19 @@ def of_sizes(truth, rng, sizes):
     drift = np.stack([2 * p1 - 6 * p2 + 12 * p3, 6 * p2 - 30 * p3, 20 * p3], axis=2)
     return replace(
         truth, drift_m=drift, plate_scale=rng.normal(0, of["plate_scale"], views),
-        plate_shape_m=rng.normal(0, of["plate_shape"], (views, 2, 3)) * [1, 2, 1],
+        plate_shape_m=bending(rng.normal(0, of["plate_shape"], (views, 2, 3))),
         backlash_m=rng.normal(0, of["approach"], 2),
         microscope=matrix_of(*rng.normal(0, of["microscope"], 4)))
+
+
+def bending(parts):
+    """Return coefficients (views, 2, 3) of x^2, xy, y^2 of a z^2 + b |z|^2 + c z*^2.
+
+    `parts`: those of a, b, c, real and imaginary, (views, 2, 3).
+    """
+    a, b, c = np.moveaxis(parts[:, 0] + 1j * parts[:, 1], 1, 0)
+    forms = np.stack([a + b + c, 2j * (a - c), b - a - c], axis=1)
+    return np.stack([forms.real, forms.imag], axis=1)
 
 
 def matrix_of(scale, turn, stretch, shear):
