@@ -98,6 +98,8 @@ class Block:
         `parts`. Empty: the effect is not in the model unless it is asked for or found.
     parts : tuple of (str, tuple of str)
         Coefficients that may have sizes of their own: name of the size, components.
+    families : tuple of tuple of str
+        Components that a cause may have without the others: their size is also tested by itself.
     plausible : float
         Largest plausible size: a larger one is a fault.
     needs_visits : bool
@@ -141,6 +143,7 @@ class Block:
     nominal: float = 0.0
     sizes: tuple[float, ...] = ()
     parts: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    families: tuple[tuple[str, ...], ...] = ()
     plausible: float = float("inf")
     needs_visits: bool = False
     of_lines: bool = False

@@ -28,6 +28,7 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
 BLOCK = Block(
     "plate_shape", "m", patterns, undetected=1e-12, nominal=10e-9,
     sizes=(5e-9,),  # what handling does to fused silica 6 mm thick
+    families=tuple((f"{form} x", f"{form} y") for form in FORMS),
     of_plate=True,
     located=against_first,
     cure="add views shifted both ways along both axes, and one along a diagonal")

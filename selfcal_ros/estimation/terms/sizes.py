@@ -49,11 +49,13 @@ class SizeTest:
         with a coverage of 95.45 % if they contradict the given size, the limit of `DOUBT_LEVEL` if
         they make it doubtful; otherwise the given size.
     statistic : float
-        b' (C + size^2 1)^-1 b; `rank` on average.
+        b' (C + size^2 1)^-1 b of all coefficients; `rank` on average.
     rank : int
-        Number of combinations of the coefficients determined by the readings.
-    p : float
+        Number of their combinations determined by the readings.
+    p_together : float
         Probability of as large a value if the size is right.
+    p : float
+        The same of whichever is the least likely: of all coefficients, or of a family of them.
     evidence : float
         Logarithm of how much likelier the readings are with the size that they show (ratio of
         marginal likelihoods); 0 if they do not make the given one doubtful.
@@ -65,6 +67,7 @@ class SizeTest:
     allowed: float
     statistic: float
     rank: int
+    p_together: float
     p: float
     evidence: float = 0.0
 
@@ -83,6 +86,9 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
               noise: tuple[float, float]) -> SizeTest:
     """Return the test of one size, the other terms with their sizes or free.
 
+    The test of all its coefficients, or of those of one family (`Block.families`): whichever
+    contradicts the size more, at the level of all of them together.
+
     Parameters
     ----------
     equations : TermEquations
@@ -94,8 +100,22 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
     noise : tuple of float
         Noise of one grid reading, m, and its degrees of freedom.
     """
+    columns = equations.columns.columns
+    every = equations.rows([term.name])
+    families = [every & np.array([column.component in family for column in columns])
+                for family in term.block.families]
+    whole, *parts = [_coefficients_test(equations, right, term, noise, rows=rows,
+                                        among=1 + len(families))
+                     for rows in (every, *families)]
+    return replace(min((whole, *parts), key=lambda test: test.p), rank=whole.rank,
+                   statistic=whole.statistic, p_together=whole.p_together)
+
+
+def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
+                       noise: tuple[float, float], *, rows: np.ndarray, among: int) -> SizeTest:
+    """Return the test of a size by the coefficients `rows`, bool (p,), one of `among` tests."""
     sigma, dof = noise
-    values, variance, of_size = _told(equations, right, equations.rows([term.name]), sigma)
+    values, variance, of_size = _told(equations, right, rows, sigma)
     rank = len(values)
 
     def spread(size: float) -> np.ndarray:
@@ -105,10 +125,10 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
         return float(values @ np.linalg.solve(spread(size), values))
 
     if not rank:
-        return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0)
+        return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
     found = statistic(term.size)
     p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
-    test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p)
+    test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p, min(1.0, among * p))
     if not test.raised:
         return test
     # b'b / (size^2 the smallest eigenvalue) is not below it

@@ -346,7 +346,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
 def _beyond_u(solved: Solved, test: SizeTest) -> bool:
     """Return whether a term is surely there, and what no reading determines of it exceeds u."""
     term = next(term for term in solved.result.model.terms if term.name == test.name)
-    if not test.p < SURELY or test.rank == len(term.estimates):
+    if not test.p_together < SURELY or test.rank == len(term.estimates):
         return False
     emap = solved.result.error_map
     whole = {"m": rms(np.stack([emap.u_gx, emap.u_gy])), "rad": rms(emap.u_g_theta)}

@@ -190,3 +190,20 @@ def test_readings_without_noise_contradict_a_size_as_well():
     _, readings = measured(7, {"plate_scale": 1e-6}, sigma_m=0.0)
     (test,) = fitted(readings, options("plate_scale:1e-8")).sizes
     assert test.contradicted and 3e-7 < test.shown < 3e-6
+
+
+def test_one_pattern_of_bending_alone_contradicts_the_size_of_all():
+    """Saddles of three times the size; with all six coefficients alike it is 1.7 times."""
+    found, size = [], SIZES["plate_shape"]
+    for seed in range(8):
+        rng, plan = np.random.default_rng(seed), plan_of(5, 2)
+        parts = np.zeros((len(plan.views), 2, 3))
+        parts[:, :, 2] = rng.normal(0, 3 * size, parts.shape[:2])
+        truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
+        truth = replace(truth, plate_shape_m=bending(parts))
+        readings = simulate_measurements(truth, plan, rng, settings=settings(), visits=True)
+        (test,) = fitted(readings, options(f"plate_shape:{size}")).sizes
+        found.append((test.p, test.p_together))
+    p, together = np.array(found).T
+    assert (p < 5e-4).all()
+    assert (together > 1e-3).sum() >= 2
