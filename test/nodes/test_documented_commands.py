@@ -91,14 +91,10 @@ def test_topics_services_and_actions_exist_with_their_types(cell):
         assert interface(of).Goal(**yaml.safe_load(goal))
 
 
-def test_nodes_transitions_and_parameters_exist(cell):
+def test_nodes_transitions_and_interfaces_exist(cell):
     nodes = {f"/{node.get_name()}": node for node in cell.nodes}
     for _, name, transition in lines("lifecycle"):
         assert hasattr(nodes[name], f"trigger_{transition}")
-    assert lines("param")
-    for _, name, *parameter in lines("param"):
-        for one in parameter:
-            assert nodes[name].has_parameter(one)
     for _, of in lines("interface"):
         assert interface(of)
 
