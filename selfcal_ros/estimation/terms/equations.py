@@ -19,6 +19,9 @@ from selfcal_ros.estimation.terms.projection import (
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is zero."""
 
+ROUNDED = 1e-12
+"""The same of one that is rounding alone: exact lines leave others of 1e-9 that are told."""
+
 LEAST_NOISE_M = 1e-12
 """Smallest noise against which sizes are weighted, m: less is rounding."""
 
@@ -391,11 +394,9 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
         `TermEquations.inverse` of it.
     """
     right = equations.unbiased_sums(found.total)
-    if sigma_m <= LEAST_NOISE_M:  # the sizes weigh next to nothing
-        everything = np.ones(equations.n, dtype=bool)
-        hidden = equations.untold(everything, UNTOLD) / equations.norm[:, None]
-        if hidden.shape[1]:  # no reading tells anything of these: what is there is rounding
-            right = right - hidden @ np.linalg.lstsq(hidden, right, rcond=None)[0]
+    # no reading tells anything of these: what is there is rounding
+    untold = equations.untold(np.ones(equations.n, dtype=bool), ROUNDED)
+    right = right - equations.norm * (untold @ (untold.T @ (right / equations.norm)))
     prior = equations.prior(sigma_m)
     return coefficients + inverse @ (right - prior * coefficients)
 
