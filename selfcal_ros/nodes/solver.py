@@ -51,6 +51,7 @@ class Solver(ManagedNode[SolverSettings]):
                          "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
         self._rejected: dict[int, Marker] = {}  # by view
+        self._rejected_in = ("", "")  # plan and run
         self._solved = self.publisher(names.private(names.SOLVED))
         self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
 
@@ -75,9 +76,18 @@ class Solver(ManagedNode[SolverSettings]):
         self.session.take_measurement(message)
         self._begin()  # shown when it is solved, later
         if message.image_x == message.image_y == 0:  # the rejections of all cells
-            marker, view = rejected_marker(message, self.settings.frame_id), message.view_index
-            if view in self._rejected or marker.action == Marker.ADD:
-                self._rejected[view] = marker
+            self._mark_rejected(message)
+
+    def _mark_rejected(self, message: Any) -> None:
+        """Keep the marker of a view's rejected detections; those of another run are deleted."""
+        of_run = (message.plan_id, message.run_id)
+        if of_run != self._rejected_in:
+            self._rejected_in = of_run
+            for before in self._rejected.values():
+                before.action = Marker.DELETE
+        marker, view = rejected_marker(message, self.settings.frame_id), message.view_index
+        if view in self._rejected or marker.action == Marker.ADD:
+            self._rejected[view] = marker
 
     def _on_command(self, message: Any) -> None:
         self.session.take_command(message)

@@ -397,6 +397,31 @@ def test_rejected_detections_are_shown_until_their_view_is_measured_without(grap
     graph.until(lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the view without")
 
 
+def test_rejected_detections_of_an_earlier_run_are_deleted(graph):
+    graph.node(Solver)
+    arrays = graph.listen(names.MAP_MARKERS)
+    readings = graph.publisher(names.MEASUREMENT)
+    plan, with_rejected = small_plan("0, 90, tx, ty"), 3
+    messages, _ = measured(plan)
+    for message in messages:
+        message.run_id = "1"
+    messages[with_rejected].rejected_reason = [0]
+    messages[with_rejected].rejected_x = [0.01]
+    messages[with_rejected].rejected_y = [-0.02]
+    messages[with_rejected].reject_reasons = ["low_score"]
+    messages[with_rejected].reject_counts = [1]
+    for message in messages:
+        readings.publish(message)
+    graph.until(lambda: arrays and arrays[-1].markers[-1].ns == "rejected", "the first run")
+    assert arrays[-1].markers[-1].action == Marker.ADD
+    again, _ = measured(plan)
+    for message in again:
+        message.run_id = "2"
+        if message.view_index != with_rejected:
+            readings.publish(message)
+    graph.until(lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the second run")
+
+
 def test_a_malformed_measurement_does_not_end_the_solver(graph):
     node = graph.node(Solver)
     summaries = graph.listen(names.SUMMARY)
