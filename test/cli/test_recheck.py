@@ -63,7 +63,10 @@ def test_the_calibrations_own_recording_is_refused(folder, capsys):
 
 def test_a_stage_that_has_changed(folder, capsys):
     out = folder / "bent.json"
-    assert main(["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out),
+    seen = ["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out)]
+    assert main(seen) == 5
+    assert "a single pass cannot tell a change from drift" in capsys.readouterr().err
+    assert main([*seen, "--force", "--model", "drift:1e-9",
                  "--report", str(folder / "bent.html")]) == 0
     text = capsys.readouterr().out
     assert text.startswith("Changed since r.json: calibrate again, provided this is the same ")

@@ -158,12 +158,15 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     found = recheck_found(change, line_change(solved.lines, plate), solved.artifact, plate,
                           passes=min(view.view.repeats for view in measurements.views))
     noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
+    declared = {term.name for term in options.terms}
+    changes = _findings(found)
     other = check_plate(readings.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
         solution.square, solution.dof,
         dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
+    if not failed and found.changed and found.passes == 1 and "drift" not in declared:
+        failed = (replace(changes[0], name="changed_or_drifted"),)
     unknowns = 2 * int(solution.known.sum()) + problem.system.grid.n_misalignments
-    declared = {term.name for term in options.terms}
     terms = tuple(TermResult(
         str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
         for term in problem.terms)
@@ -173,7 +176,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         measurements.plan_id, solved.error_map(), plate.result.artifact_map,
         views_of(measurements, problem, parameters), Observability(unknowns, unknowns, 0, True),
         noise, measurements.all_rejected(),
-        findings=() if failed else _findings(found),
+        findings=() if failed else changes,
         sense=str(measurements.sense), extra=kept_covariance(covers),
         run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
@@ -188,7 +191,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
 def _findings(found: Recheck) -> tuple[Finding, ...]:
     """Return what has changed: the map, and the scale that is no part of it."""
     largest, scale, of = found.largest, found.scale, {"of": found.of}
-    where = {"x": largest.x, "y": largest.y, "passes": found.passes, **of}
+    where = {"x": largest.x, "y": largest.y, **of}
     out: tuple[Finding, ...] = ()
     if found.changed:
         out = (Finding("changed", largest.change, largest.u, "m", found.p, axis=largest.axis,

@@ -188,7 +188,8 @@ SENTENCES: dict[str, Words] = {
     "axes_not_met": lambda f, of: (
         "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
         f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"),
-    "changed": phrases.changed_text, "plate_misfit": phrases.misfit_text,
+    "changed": phrases.changed_text, "changed_or_drifted": phrases.changed_or_drifted_text,
+    "plate_misfit": phrases.misfit_text,
     "scale_changed": phrases.scale_changed_text, "other_plate": phrases.other_plate_text,
     "prediction_failed": lambda f, of: (
         f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "

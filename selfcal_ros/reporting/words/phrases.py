@@ -124,15 +124,15 @@ def excluded_text(line: BudgetLine) -> str:
 
 STILL_GOOD = "Still good"
 CHANGED = "Changed"
-ONE_PASS = ("a single pass cannot tell a change from drift, two passes can (repeats: 2, "
-            "visit_order: there_and_back)")
+ONE_PASS = ("a single pass cannot tell a change from drift: measure two passes (repeats: 2, "
+            "visit_order: there_and_back), or declare the drift (--model drift:SIZE)")
 
 
 def recheck_sentence(found: Recheck) -> str:
     """Return the verdict of a recheck in one sentence."""
     since, scale, clearest = _since(found.of), found.scale, _clearest(found.largest)
     if found.changed:
-        return _changed(since, clearest, p=found.p, one_pass=found.passes == 1)
+        return _changed(since, clearest, found.p)
     if scale.changed:
         return (f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
                 f"change beyond its uncertainty (p = {found.p:.2g}); {clearest}")
@@ -145,10 +145,9 @@ def _since(where: str) -> str:
     return printable(os.path.basename(where))
 
 
-def _changed(since: str, clearest: str, *, p: float, one_pass: bool) -> str:
-    drift = f"; {ONE_PASS}" * one_pass
+def _changed(since: str, clearest: str, p: float) -> str:
     return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
-            f"clean and placed as planned; {clearest} (p = {p:.2g}){drift}")
+            f"clean and placed as planned; {clearest} (p = {p:.2g})")
 
 
 def _scale_changed(since: str, change: float, u: float, p: float) -> str:
@@ -197,8 +196,17 @@ def recheck_lines(found: Recheck) -> list[str]:
 
 def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a stage that has changed."""
-    clearest = _clearest(LargestChange(of["x"], of["y"], found.axis, found.size, found.u))
-    return _changed(_since(str(of["of"])), clearest, p=found.p, one_pass=of.get("passes") == 1)
+    return _changed(_since(str(of["of"])), _clearest_of(found, of), found.p)
+
+
+def changed_or_drifted_text(found: Finding, of: Mapping[str, Any]) -> str:
+    """Return the reason why a change that one pass shows is not qualified."""
+    return (f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
+            f"(p = {found.p:.2g}); {ONE_PASS}")
+
+
+def _clearest_of(found: Finding, of: Mapping[str, Any]) -> str:
+    return _clearest(LargestChange(of["x"], of["y"], found.axis, found.size, found.u))
 
 
 def misfit_text(found: Finding, _: Mapping[str, Any]) -> str:

@@ -146,7 +146,7 @@ def require_within(away: np.ndarray) -> None:
     (1.0, {"repeats": 2, **DISTORTED})])
 def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
     away, changes, results = population(part * MARK, 12, **settings)
-    assert all(result.verdict.qualified for result in results)
+    assert all(result.verdict.qualified or result.recheck.changed for result in results)
     require_within(away)
     require_within(changes)
     assert sum(result.recheck.changed for result in results) <= 2

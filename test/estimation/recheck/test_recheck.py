@@ -171,7 +171,7 @@ def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose, node
     first = saved(calibrate(before, linear()))
     result = recheck(after, linear(), known_plate(first, "r.json"))
     assert result.error_map.valid.sum() > nodes**2 / 2
-    assert result.verdict.qualified
+    assert {found.name for found in result.verdict.failed} <= {"changed_or_drifted"}
     require_same(result, TwoSessions(before, after, before.artifact, first.noise.sigma_xy,
                                      known=result.error_map.valid), rel=1e-4)
 
