@@ -13,6 +13,7 @@ from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.model.view import Plan
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.summary.numbers import counted
+from selfcal_ros.reporting.words.phrases import ONE_PASS
 from selfcal_ros.results import read_result
 
 
@@ -66,5 +67,6 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
         *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
-        f"  change of XY since the calibration: rms {found.change:.4f}"]))
+        f"  change of XY since the calibration: rms {found.change:.4f}",
+        *([ONE_PASS] if min(view.repeats for view in plan.views) == 1 else [])]))
     return int(ExitCode.DONE)

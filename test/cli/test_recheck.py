@@ -118,6 +118,7 @@ def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
     text = capsys.readouterr().out
     assert f"1 view of the plate calibrated in {folder / 'r.json'}" in text
     assert f"change of XY since the calibration: rms {wanted['rms_gain_change']:.4f}" in text
+    assert "a single pass cannot tell a change from drift" in text
     spec = SEEDS | {"noise_seed": 2, "plan": "plan.yaml"}
     (folder / "morning.yaml").write_text(json.dumps(spec))
     bag, one, other = (str(folder / name) for name in ("morning", "one.json", "other.json"))
