@@ -136,7 +136,8 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
     u = np.stack([emap.u_gx, emap.u_gy])
     good = np.isfinite(u)
     inside = float(np.mean(np.abs(error[good]) < result.noise.k_xy * u[good]))
-    return (before.verdict.qualified and result.verdict.qualified,
+    failed = {found.name for found in result.verdict.failed}
+    return (before.verdict.qualified and failed <= {"changed_or_drifted"},  # read in one pass
             bool(result.recheck.changed), inside,
             float(np.sqrt(np.mean((error[good] / u[good]) ** 2))))
 
