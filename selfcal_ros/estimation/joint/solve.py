@@ -42,10 +42,10 @@ from selfcal_ros.estimation.joint.solved import (
     noise_of,
     saved_terms,
 )
-from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.placed import PlacedEquations
 from selfcal_ros.estimation.normal.systems import system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
@@ -350,7 +350,7 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     # the plate's covariance takes a factor of its own, as large as that of the stage
     if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
-        if system.grid.n_sites <= MAX_SITES and isinstance(system.grid.views, LatticeViews):
+        if system.grid.n_sites <= MAX_SITES and not isinstance(system, PlacedEquations):
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:

@@ -8,63 +8,20 @@ A finite rotation adds (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A to it (me
 R(phi) = exp(i phi).
 """
 
-from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from math import ceil
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.readings import AnyPose, MapPose, pose_of
+from selfcal_ros.estimation.lattice.readings import pose_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import ViewReadings
 from selfcal_ros.model.result import ArtifactMap
 
-if TYPE_CHECKING:
-    from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
-
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
-
-
-@dataclass(frozen=True)
-class Window:
-    """Marks of one view and their sites, as slices into the plate and into the field."""
-
-    marks: tuple[slice, slice]
-    sites: tuple[slice, slice]
-    transposed: bool
-
-
-def window(pose: LatticePose, half: tuple[float, float]) -> Window:
-    """Return the marks of a view inside the field, and their sites, as slices.
-
-    Site = R^q (u, v) + (a, b); a field with half widths `half`, pitches.
-    """
-    (hx, hy), swap = half, pose.q % 2 == 1
-    # stage x = sx * (u or v) + a, stage y = sy * (v or u) + b
-    sx, sy = ((1, 1), (-1, 1), (-1, -1), (1, -1))[pose.q]
-    along_x, along_y = ((hy, hx) if swap else (hx, hy))
-    p = _run(sx, pose.a, along_x, hx)
-    r = _run(sy, pose.b, along_y, hy)
-    marks = (r[0], p[0]) if swap else (p[0], r[0])
-    return Window(marks, (p[1], r[1]), swap)
-
-
-def _run(sign: int, shift: float, half_mark: float, half_site: float) -> tuple[slice, slice]:
-    """Return the slices of u in [-half_mark, half_mark] with sign*u + shift in the field.
-
-    Steps of 1. All ends are whole numbers, or all odd multiples of 1/2.
-    """
-    ends = sorted((sign * (-half_site - shift), sign * (half_site - shift)))
-    low, high = max(ends[0], -half_mark), min(ends[1], half_mark)
-    if low > high:
-        return slice(0), slice(0)
-    first, last = (int(sign * end + shift + half_site) for end in (low, high))
-    stop = last + sign
-    return (slice(int(low + half_mark), int(high + half_mark) + 1),
-            slice(first, None if stop < 0 else stop, sign))
 
 
 class LatticeViews:
@@ -80,29 +37,27 @@ class LatticeViews:
         Pitches in the unit of positions; 0 = the longer half width.
     """
 
+    bilinear = False
+    """Whether the map is bilinear between its nodes; on a lattice the nodes are the sites."""
+    node_pitch = 1.0
+    """Distance of neighbouring nodes, in pitches of the plate."""
+
     def __init__(self, shape: tuple[int, int], poses: tuple[LatticePose, ...],
                  unit: float = 0) -> None:
-        self.shape, self.poses = shape, poses
+        self.shape, self.plate_shape, self.poses = shape, shape, poses
         self.half = (shape[0] - 1) / 2, (shape[1] - 1) / 2
         self.unit = unit or max(self.half)
-        self.windows = tuple(window(pose, self.half) for pose in poses)
 
     @property
     def reach(self) -> int:
         """Largest folded distance, in pitches, of two sites visited by one mark, rounded up."""
         out = 0.0
-        for p in self.poses:
-            for r in self.poses:
-                if p.q == r.q:
-                    out = max(out, abs(p.a - r.a), abs(p.b - r.b))
-                else:
-                    out = max(out, max(abs(p.a), abs(p.b)) + max(abs(r.a), abs(r.b)))
+        for (p, r), (turn, other) in zip(product(self.shifts, repeat=2),
+                                         product(self.phases, repeat=2), strict=True):
+            (a, b), (c, d) = (p.real, p.imag), (r.real, r.imag)
+            out = max(out, max(abs(a - c), abs(b - d)) if turn == other else
+                      max(abs(a), abs(b)) + max(abs(c), abs(d)))
         return ceil(out)
-
-    @property
-    def plate_shape(self) -> tuple[int, int]:
-        """Marks along x and y."""
-        return self.shape
 
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
         """Return the m and n of a mark by its index."""
@@ -114,42 +69,53 @@ class LatticeViews:
 
     @cached_property
     def phases(self) -> np.ndarray:
-        """i^q of every view, exact, complex (views,)."""
+        """Factor of every view from the plate frame to the stage frame, complex (views,)."""
         return np.array([pose.phase for pose in self.poses], dtype=complex)
 
     @cached_property
     def shifts(self) -> np.ndarray:
         """Position of the plate's centre in every view, in pitches, complex (views,)."""
-        return np.array([pose.a + 1j * pose.b for pose in self.poses], dtype=complex)
+        return np.array([complex(*pose.shift) for pose in self.poses], dtype=complex)
 
     @cached_property
     def z_sites(self) -> np.ndarray:
-        """Site positions in the unit, complex (nx, ny)."""
+        """Node positions in the unit, complex (cx, cy)."""
         return self.z
 
     @cached_property
+    def places(self) -> np.ndarray:
+        """Mark positions, in pitches, complex (nx, ny)."""
+        x, y = (np.arange(size) - half for size, half in zip(self.shape, self.half, strict=True))
+        return x[:, None] + 1j * y
+
+    @property
     def z(self) -> np.ndarray:
         """Mark positions in the unit, complex (nx, ny)."""
-        x, y = (np.arange(size) - half for size, half in zip(self.shape, self.half, strict=True))
-        return (x[:, None] + 1j * y) / self.unit
+        return self.places / self.unit
+
+    @cached_property
+    def from_corner(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
+        turn, shift = (part[:, None, None] for part in (self.phases, self.shifts))
+        at = (turn * self.places + shift) / self.node_pitch
+        return at.real + self.half[0], at.imag + self.half[1]
 
     @cached_property
     def in_field(self) -> np.ndarray:
         """Marks inside the field, bool (views, nx, ny)."""
-        out = np.zeros((len(self.poses), *self.shape), dtype=bool)
-        for index, win in enumerate(self.windows):
-            out[index][win.marks] = True
-        return out
+        (x, y), (nx, ny) = self.from_corner, self.shape
+        return (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
 
     @cached_property
     def site_index(self) -> np.ndarray:
-        """Flat index of the site of every mark, int (views, nx, ny); -1 off the field."""
-        flat = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
-        out = np.full((len(self.poses), *self.shape), -1)
-        for index, win in enumerate(self.windows):
-            sites = flat[win.sites]
-            out[index][win.marks] = sites.T if win.transposed else sites
-        return out
+        """Flat index of the node nearest to every mark, int (views, nx, ny); -1 off the field."""
+        i, j = (np.clip(np.rint(part).astype(int), 0, size - 1)
+                for part, size in zip(self.from_corner, self.shape, strict=True))
+        return np.where(self.in_field, i * self.shape[1] + j, -1)
+
+    def near(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the marks on sites of a bool array (nx, ny), (views, nx, ny)."""
+        return self.in_field & nodes.reshape(-1)[self.site_index]
 
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return i^-q G(X_v(m)), complex (..., views, nx, ny), 0 where the mark is off the field.
@@ -159,71 +125,37 @@ class LatticeViews:
         field : complex array (..., nx, ny)
             G, or several fields.
         """
-        out = np.zeros((*field.shape[:-2], len(self.poses), *self.shape), dtype=complex)
-        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
-            sites = field[(..., *win.sites)]
-            np.multiply(sites.swapaxes(-1, -2) if win.transposed else sites, PHASES[-pose.q % 4],
-                        out=out[(..., index, *win.marks)])
-        return out
-
-    def gather_mean(self, field: np.ndarray, relative_weight: np.ndarray) -> np.ndarray:
-        """Return the sum over views of relative_weight times `gather`, complex (nx, ny)."""
-        out = np.zeros(self.shape, dtype=complex)
-        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
-            sites = field[win.sites]
-            part = (sites.T if win.transposed else sites) * relative_weight[index][win.marks]
-            _add_turned(out[win.marks], part, -pose.q % 4)
-        return out
-
-    def subtract_scattered(self, out: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> None:
-        """Subtract the scatter of weight times one field over the marks from `out`."""
-        for index, (pose, win) in enumerate(zip(self.poses, self.windows, strict=True)):
-            part = weight[index][win.marks] * mean[win.marks]
-            _add_turned(out[win.sites], part.T if win.transposed else part, (pose.q + 2) % 4)
-
-    def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
-        """Add the scatter of one view's fields over the marks to `out`, (..., nx, ny) both."""
-        win = self.windows[index]
-        part = marks[(..., *win.marks)]
-        _add_turned(out[(..., *win.sites)], part.swapaxes(-1, -2) if win.transposed else part,
-                    self.poses[index].q)
-
-    def scatter_weight(self, weight: np.ndarray) -> np.ndarray:
-        """Return the sum of the weights of all readings at every site, (nx, ny)."""
-        out = np.zeros(self.shape)
-        for index, win in enumerate(self.windows):
-            part = weight[index][win.marks]
-            out[win.sites] += part.T if win.transposed else part
+        out = _taken(field, self.site_index)
+        out *= self.phases.conj()[:, None, None]
         return out
 
     @cached_property
-    def _of_site(self) -> tuple[np.ndarray, np.ndarray]:
-        """Index of the mark on every site, and i^q or 0 if there is none, (views, sites)."""
-        n = self.shape[0] * self.shape[1]
-        place = np.zeros((len(self.poses), n), dtype=int)
-        phase = np.zeros(place.shape, dtype=complex)
-        for v, pose in enumerate(self.poses):
-            marks = np.flatnonzero(self.in_field[v])
-            sites = self.site_index[v].reshape(-1)[marks]
-            place[v, sites], phase[v, sites] = marks + v * n, PHASES[pose.q]
-        return place, phase
+    def _mark_on(self) -> np.ndarray:
+        """Flat index of the mark on every site in each view, int (views, nx, ny); -1 = none."""
+        out = np.full((len(self.poses), self.shape[0] * self.shape[1]), -1)
+        for mark_on, site in zip(out, self.site_index.reshape(out.shape), strict=True):
+            here = np.flatnonzero(site >= 0)
+            mark_on[site[here]] = here
+        return out.reshape(-1, *self.shape)
+
+    def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
+        """Add the scatter of one view's fields over the marks to `out`, (..., nx, ny) both."""
+        out += _taken(marks, self._mark_on[index]) * self.phases[index]
 
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
-        place, phase = self._of_site
-        return (marks.reshape(-1)[place] * phase).sum(axis=0).reshape(self.shape)
+        out = np.zeros(self.shape, dtype=complex)
+        for index, one in enumerate(marks):
+            self.add_scattered(out, index, one)
+        return out
 
 
-def _add_turned(out: np.ndarray, part: np.ndarray, q: int) -> None:
-    """Add i^q times `part` to `out` without multiplying: only signs and parts are exchanged."""
-    if q == 0:
-        out += part
-    elif q == 2:
-        out -= part
-    else:
-        sign = np.subtract if q == 1 else np.add
-        sign(out.real, part.imag, out=out.real)
-        (np.add if q == 1 else np.subtract)(out.imag, part.real, out=out.imag)
+def _taken(fields: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return values of fields (..., nx, ny) at flat indices, complex (..., *at); 0 at -1."""
+    *several, nx, ny = fields.shape
+    flat = np.zeros((*several, nx * ny + 1), dtype=complex)
+    flat[..., :-1] = fields.reshape(*several, nx * ny)
+    return flat.take(at, axis=-1, mode="wrap")  # -1 is the 0 at its end
 
 
 def rigid_parameters(views: LatticeViews) -> np.ndarray:
@@ -240,20 +172,6 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
     return out
-
-
-type AnyViews = LatticeViews | PlacedViews
-"""The maps of the grid views of one calibration."""
-
-
-def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> AnyViews:
-    """Return the maps of views of a plate with `shape` marks."""
-    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
-    if placed:
-        from selfcal_ros.estimation.lattice.placed import PlacedViews  # splines
-
-        return PlacedViews(placed)
-    return LatticeViews(shape, tuple(pose for pose in poses if isinstance(pose, LatticePose)))
 
 
 def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:

@@ -4,8 +4,7 @@
 In the plate frame the model reads, for view v turned by alpha_v (method eqs. 12.1, 12.2),
     y_v(m) = e^(-i alpha_v) G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,
     G(X) = sum_j w_j(X) G_j,   w real, sum w = 1,
-with G_j the error at node j. The same members as `selfcal_ros.estimation.lattice.maps.LatticeViews`
-lead from nodes to marks; there w is 1 at one site.
+with G_j the error at node j. On the lattice w is 1 at one site.
 
 Of a spline the unknowns are coefficients of B-splines: a place has only (degree + 1)^2 of them, so
 that its row is sparse; one matrix along each axis leads from node values to coefficients. The
@@ -20,9 +19,10 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.sparse import csr_matrix
 
-from selfcal_ros.estimation.lattice.readings import MapPose
+from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.lattice.readings import AnyPose, MapPose
 from selfcal_ros.model.artifact import Artifact, Interpolation
-from selfcal_ros.model.pose import EDGE
+from selfcal_ros.model.pose import EDGE, LatticePose
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ class MapSpline:
         return self.adjoint(half.T.reshape(n, *self.shape)).reshape(n, n)
 
 
-class PlacedViews:
+class PlacedViews(LatticeViews):
     """The maps between nodes and marks for the grid views of one calibration.
 
     Parameters
@@ -176,30 +176,24 @@ class PlacedViews:
         Of the map; by default the one through its nodes.
     """
 
+    poses: tuple[MapPose, ...]  # type: ignore[assignment]
+
     def __init__(self, poses: tuple[MapPose, ...], spline: MapSpline | None = None) -> None:
         artifact = poses[0].artifact
         grid = artifact.map_grid
         self.poses, self.artifact = poses, artifact
         self.spline = spline or MapSpline.of(
             artifact.field, grid.interpolation if grid else Interpolation.BICUBIC)
+        self.bilinear = self.spline.axes[0].degree == 1
+        self.node_pitch = artifact.field.grid_pitch_m / artifact.grid_pitch_m
         self.shape, self.half = self.spline.shape, artifact.field.half
         self.plate_shape, self.unit = artifact.shape, max(artifact.reach)
 
     @cached_property
-    def phases(self) -> np.ndarray:
-        """exp(i alpha) of every view, complex (views,)."""
-        return np.array([pose.phase for pose in self.poses], dtype=complex)
-
-    @cached_property
-    def shifts(self) -> np.ndarray:
-        """Position of the plate's centre in every view, in pitches, complex (views,)."""
-        return np.array([complex(*pose.pose.shift) for pose in self.poses])
-
-    @cached_property
-    def z(self) -> np.ndarray:
-        """Mark positions in the unit, complex (nx, ny)."""
+    def places(self) -> np.ndarray:
+        """Mark positions, in pitches, complex (nx, ny)."""
         x, y = self.artifact.places(self.artifact.m, self.artifact.n)
-        return (x + 1j * y) / self.unit
+        return x + 1j * y
 
     @cached_property
     def z_sites(self) -> np.ndarray:
@@ -231,26 +225,6 @@ class PlacedViews:
         summed = self.phases[index] * (self.rows[index].T @ flat)
         out += self.spline.adjoint(summed.T.reshape(out.shape))
 
-    def scatter(self, marks: np.ndarray) -> np.ndarray:
-        """Return the adjoint of `gather` for (views, nx, ny): complex (cx, cy)."""
-        total = sum((phase * (rows.T @ one.ravel()) for phase, rows, one in zip(
-            self.phases, self.rows, marks, strict=True)), start=np.zeros(1, dtype=complex))
-        return self.spline.adjoint(np.broadcast_to(total, self.z_sites.size).reshape(self.shape))
-
-    @cached_property
-    def from_corner(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
-        step = self.artifact.grid_pitch_m / self.artifact.field.grid_pitch_m
-        x, y = np.array([pose.sites for pose in self.poses]).swapaxes(0, 1) * step
-        return x + self.half[0], y + self.half[1]
-
-    @cached_property
-    def site_index(self) -> np.ndarray:
-        """Flat index of the node nearest to every mark, int (views, nx, ny); -1 off the field."""
-        i, j = (np.clip(np.rint(part).astype(int), 0, size - 1)
-                for part, size in zip(self.from_corner, self.shape, strict=True))
-        return np.where(self.in_field, i * self.shape[1] + j, -1)
-
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
         """Return the m and n of a mark by its index."""
         m, n = self.artifact.marks_at(np.array(i), np.array(j))
@@ -267,3 +241,10 @@ class PlacedViews:
                 for part, size in zip(self.from_corner, self.shape, strict=True))
         return self.in_field & (nodes[i, j] & nodes[i + 1, j] & nodes[i, j + 1]
                                 & nodes[i + 1, j + 1])
+
+
+def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> LatticeViews:
+    """Return the maps of views of a plate with `shape` marks."""
+    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
+    return PlacedViews(placed) if placed else LatticeViews(
+        shape, tuple(pose for pose in poses if isinstance(pose, LatticePose)))

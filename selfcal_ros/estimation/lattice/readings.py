@@ -34,6 +34,11 @@ class MapPose:
         return self.pose.phase
 
     @property
+    def shift(self) -> tuple[float, float]:
+        """Position of the plate's centre along stage x and y, pitches."""
+        return self.pose.shift
+
+    @property
     def turn_lines(self) -> float | None:
         """Its turn in angular lines; None between two of them, unless the map is a series."""
         return self.pose.turn_lines

@@ -104,7 +104,7 @@ class PlacedSystem(GridSystem):
         If the map has more nodes than can be factorised.
     """
 
-    views: PlacedViews  # type: ignore[assignment]
+    views: PlacedViews
 
     def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray,
                  spline: MapSpline | None = None, rotations: tuple[int, ...] = ()) -> None:

@@ -21,6 +21,7 @@ from selfcal_ros.estimation.lattice.readings import (
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
+from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
@@ -89,8 +90,6 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
     lines = lines_of(angular)
     placed = tuple(pose for pose in grid.poses if isinstance(pose, MapPose))
     if placed:
-        from selfcal_ros.estimation.normal.placed import PlacedEquations, PlacedSystem  # splines
-
         return PlacedEquations(PlacedSystem(placed, grid.weight, rotations=grid.rotations), lines,
                                grid.index, angular.index)
     poses = tuple(pose for pose in grid.poses if isinstance(pose, LatticePose))

@@ -18,7 +18,7 @@ from scipy.special import fdtri
 
 from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.lattice.maps import maps_of
+from selfcal_ros.estimation.lattice.placed import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M

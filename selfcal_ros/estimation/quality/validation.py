@@ -21,7 +21,8 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess, turned_marks, turned_plate
+from selfcal_ros.estimation.lattice.maps import rotation_excess, turned_marks, turned_plate
+from selfcal_ros.estimation.lattice.placed import maps_of
 from selfcal_ros.estimation.lattice.readings import pose_of
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.observability.plan_check import (

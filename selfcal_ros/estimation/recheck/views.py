@@ -20,9 +20,9 @@ from selfcal_ros.estimation.joint.fit import Moving
 from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.lattice.maps import LatticeViews, rotation_excess
+from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.normal.angular import HarmonicSystem
-from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE
+from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE, PlacedSystem
 from selfcal_ros.estimation.normal.systems import Marks, lines_of
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
@@ -359,7 +359,7 @@ def _known_nodes(readings: PlateReadings, design: np.ndarray, covariance: np.nda
     and that of those shows it again.
     """
     grid = readings.problem.system.grid
-    z, n, lattice = grid.views.z_sites, read.size, isinstance(grid.views, LatticeViews)
+    z, n, lattice = grid.views.z_sites, read.size, not isinstance(grid, PlacedSystem)
     core = read & (np.maximum(abs(z.real), abs(z.imag)) < CORE)
     known = read if lattice or core.sum() < 3 else core  # three nodes a side have one in the core
     spread = np.tile(1 / readings.weight, 2)

@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
-from selfcal_ros.estimation.lattice.maps import AnyViews, LatticeViews, maps_of
+from selfcal_ros.estimation.lattice.maps import LatticeViews
+from selfcal_ros.estimation.lattice.placed import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.error_map import rms
@@ -33,7 +34,7 @@ class StagePlaces:
 
     Attributes
     ----------
-    views : LatticeViews or PlacedViews
+    views : LatticeViews
         Marks and sites of the views.
     pitch_m : float
         Distance of neighbouring sites, m.
@@ -49,7 +50,7 @@ class StagePlaces:
         Indicated position at each visit less the mean of its mark, m.
     """
 
-    views: AnyViews
+    views: LatticeViews
     pitch_m: float
     known: np.ndarray
     at: tuple[np.ndarray, ...]
@@ -70,8 +71,6 @@ class StagePlaces:
     @cached_property
     def nominal(self) -> tuple[np.ndarray, np.ndarray]:
         """Nominal place of the mark of each reading, in pitches from the first node, (P,) each."""
-        if isinstance(self.views, LatticeViews):
-            return np.divmod(self.site, self.known.shape[1])
         s, t = self.views.from_corner
         return s[self.at], t[self.at]
 
@@ -97,10 +96,7 @@ class StagePlaces:
 
     def _at_nominal(self, field: np.ndarray) -> np.ndarray:
         """Return a field at the nominal place of each reading, (P,)."""
-        if isinstance(self.views, LatticeViews):
-            return field.reshape(-1)[self.site]
-        x, y = self._cells(field).beyond(*self.nominal)
-        return x + 1j * y
+        return self.views.gather(field)[self.at] * self.views.phases[self.at[0]]
 
     def errors(self, field: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
         """Return the stage error where the stage stood, (P,), m, given that at the sites."""
@@ -150,7 +146,7 @@ class StagePlaces:
     def _cells(self, field: np.ndarray, *, local: bool = False) -> Cells:
         """Return the interpolant of a field between the nodes of the map."""
         both = np.stack([field.real, field.imag])
-        if not isinstance(self.views, LatticeViews) and self.views.spline.axes[0].degree == 1:
+        if self.views.bilinear:
             return bilinear_cells(both)
         return bicubic_cells(both, local=local)
 
@@ -211,11 +207,8 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
         away[row], located[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
         marks.append(visits.mark)
         about.append(stood - mean[visits.mark])
-    if isinstance(views, LatticeViews):
-        located &= known.reshape(-1)[views.site_index] & (grid.weight > 0)
-        pitch_m = ground.half_width_m / views.unit
-    else:
-        located, pitch_m = located & views.near(known) & (grid.weight > 0), views.spline.pitch_m
+    located &= views.near(known) & (grid.weight > 0)
+    pitch_m = ground.half_width_m / views.unit * views.node_pitch
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
     return StagePlaces(views, pitch_m, known, np.nonzero(located), away[located], tuple(marks),

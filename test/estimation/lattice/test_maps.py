@@ -49,25 +49,15 @@ def test_fields_go_to_the_marks_and_back_as_dense_matrices_take_them():
     views, matrices = LatticeViews((SIDE, SIDE), POSES), [dense(pose) for pose in POSES]
     field = rng.normal(size=(SIDE, SIDE, 2)) @ [1, 1j]
     marks = rng.normal(size=(4, SIDE, SIDE, 2)) @ [1, 1j]
-    weight = rng.uniform(0.5, 2, (4, SIDE, SIDE))
     gathered = [(matrix @ field.ravel()).reshape(SIDE, SIDE) for matrix in matrices]
     back = [(matrix.conj().T @ one.ravel()).reshape(SIDE, SIDE)
             for matrix, one in zip(matrices, marks, strict=True)]
     assert views.gather(field) == pytest.approx(np.array(gathered))
-    assert views.gather_mean(field, weight) == pytest.approx((weight * gathered).sum(axis=0))
     assert views.scatter(marks) == pytest.approx(np.sum(back, axis=0))
     for index in range(4):
         out = field.copy()
         views.add_scattered(out, index, marks[index])
         assert out == pytest.approx(field + back[index])
-    out = field.copy()
-    views.subtract_scattered(out, weight, marks[0])
-    assert out == pytest.approx(field - sum(
-        (matrix.conj().T @ (one * marks[0]).ravel()).reshape(SIDE, SIDE)
-        for matrix, one in zip(matrices, weight, strict=True)))
-    assert views.scatter_weight(weight) == pytest.approx(sum(
-        (abs(matrix).T @ one.ravel()).reshape(SIDE, SIDE)
-        for matrix, one in zip(matrices, weight, strict=True)))
 
 
 @pytest.mark.parametrize("q", range(4))
@@ -76,6 +66,4 @@ def test_a_view_that_leaves_the_field_adds_nothing(shift, q):
     views = LatticeViews((SIDE, SIDE), (LatticePose(q, shift, None), POSES[1]))
     field, out = np.zeros((2, SIDE, SIDE), dtype=complex)
     views.add_scattered(out, 0, field + 1)
-    views.subtract_scattered(out, np.array([field + 1, field]), field + 1)
     assert not out.any() and not views.gather(field + 1)[0].any()
-    assert (views.scatter_weight(np.ones((2, SIDE, SIDE))) == 1).all()
