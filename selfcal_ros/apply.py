@@ -154,8 +154,8 @@ class StageMap(Compensator):
         if not self.error_map.valid.ravel()[used].all():
             raise InputError("covariance", "a point lies next to an unknown site",
                              "leave the point out, or measure the site")
-        sites, is_full = xy_covariance(self.result, used.reshape(self.error_map.artifact.shape))
-        if not is_full:
+        sites = xy_covariance(self.result, used.reshape(self.error_map.artifact.shape))
+        if sites.ndim == 1:
             raise InputError("covariance", "the result does not contain the correlations of its "
                              "sites", "solve again with uncertainties; fields beyond 31 x 31 "
                              "marks have none")

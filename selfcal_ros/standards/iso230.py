@@ -314,10 +314,10 @@ def _map_draws(stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int)
     emap = stage.error_map
     chosen = np.zeros(emap.artifact.shape, dtype=bool)
     chosen[place] = True
-    cover, is_full = xy_covariance(stage.result, chosen)
+    cover = xy_covariance(stage.result, chosen)
     n = int(chosen.sum())
     part = slice(axis * n, (axis + 1) * n)
-    own = cover[part, part] if is_full else np.diag(cover[part])
+    own = cover[part, part] if cover.ndim == 2 else np.diag(cover[part])
     order = np.argsort(np.ravel_multi_index(place, emap.artifact.shape))
     out = np.empty((DRAWS, n))
     out[:, order] = _draws(own)

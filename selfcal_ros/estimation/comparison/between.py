@@ -41,8 +41,6 @@ class Run:
         Whether it has a common part.
     dof : float
         Degrees of freedom of its covariance.
-    correlated : bool
-        Whether the correlations are known.
     """
 
     values: np.ndarray
@@ -50,7 +48,6 @@ class Run:
     common: np.ndarray
     shares: bool
     dof: float
-    correlated: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +328,7 @@ def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray
     shares = np.array([run.shares for run in runs], dtype=float)
     total = _sum([*own, common], np.append(factors, (shares[i] - others @ shares) ** 2))
     dof = _noise_dof(runs, own, factors)
-    full = all(run.correlated for run in runs) and total.ndim == 2
+    full = all(run.covariance.ndim == 2 for run in runs)
     test = significance(rest, Spread(total if full else _diagonal(total), q, dof))
     u = np.sqrt(_diagonal(total))
     e_n = np.divide(rest, coverage_factor(dof) * u, out=np.zeros_like(rest), where=u > 0)

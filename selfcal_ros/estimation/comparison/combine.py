@@ -184,11 +184,11 @@ def _xy_run(part: Part, known: np.ndarray, *, keep_scale: bool) -> Run:
     values = np.concatenate([emap.gx[known], emap.gy[known]])
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
     if result is None:
-        return Run(values, u**2, np.zeros(len(u)), False, np.inf, False)
-    covariance, is_full = xy_covariance(result, known)
+        return Run(values, u**2, np.zeros(len(u)), False, np.inf)
+    covariance = xy_covariance(result, known)
     factors = _common(result, known, keep_scale=keep_scale)
-    common = factors.T @ factors if is_full else (factors**2).sum(axis=0)
-    return Run(values, covariance - common, common, True, result.noise.dof_of("xy"), is_full)
+    common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
+    return Run(values, covariance - common, common, True, result.noise.dof_of("xy"))
 
 
 def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -> np.ndarray:
@@ -214,9 +214,8 @@ def _theta_run(part: Part, lines: np.ndarray) -> Run:
     emap, result = part.error_map, part.result
     values, zero = emap.g_theta[lines], np.zeros(int(lines.sum()))
     if result is None:
-        return Run(values, emap.u_g_theta[lines] ** 2, zero, False, np.inf, False)
-    covariance, is_full = theta_covariance(result, lines)
-    return Run(values, covariance, zero, True, result.noise.dof_of("theta"), is_full)
+        return Run(values, emap.u_g_theta[lines] ** 2, zero, False, np.inf)
+    return Run(values, theta_covariance(result, lines), zero, True, result.noise.dof_of("theta"))
 
 
 def _polynomials(x: np.ndarray, y: np.ndarray, known: np.ndarray) -> np.ndarray:

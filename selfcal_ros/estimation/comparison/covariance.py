@@ -39,8 +39,8 @@ known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^
 (rad^2)."""
 
 
-def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the covariance of Gx, Gy at the known sites, m^2, and whether it is a full matrix.
+def xy_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
+    """Return the covariance of Gx, Gy at the known sites, m^2.
 
     (2n, 2n), or the variances (2n,) if the correlations are unknown.
     """
@@ -49,13 +49,13 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if "xy" in (stored := result.extra.get(COVARIANCE, {})):
         return _stored(stored, "xy", np.tile(emap.valid, (2, 1)), np.tile(known, (2, 1)))
     if known.size > MAX_SITES or not np.isfinite(u).all():
-        return u**2, False
+        return u**2
     if result.method == "law":
         law, both = law_covariance(result), np.tile(known.ravel(), 2)
-        return (u**2, False) if law is None else (_sized(law[0][np.ix_(both, both)], u), True)
+        return u**2 if law is None else _sized(law[0][np.ix_(both, both)], u)
     system = system_behind(result)
     if system is None or _lacks_terms(result):
-        return u**2, False
+        return u**2
     rows = unit_rows(known)
     if is_flipped(result):
         rows = rows[:, ::-1, ::-1]
@@ -64,7 +64,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndar
     if (images := images_behind(result, system)) is not None:
         cover = cover + share_of(result) * images.added_covariance(maps.sensitivities(rows))
     factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
-    return _sized(cover + factors.T @ factors, u), True
+    return _sized(cover + factors.T @ factors, u)
 
 
 def _lacks_terms(result: CalibrationResult) -> bool:
@@ -81,19 +81,19 @@ def unit_rows(known: np.ndarray) -> np.ndarray:
     return rows.reshape(-1, *known.shape)
 
 
-def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
+def theta_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
     """Return the covariance of Gtheta at the known lines, rad^2; variances if not available."""
     u = result.error_map.u_g_theta[known]
     if "theta" in (stored := result.extra.get(COVARIANCE, {})):
         return _stored(stored, "theta", np.isfinite(result.error_map.g_theta), known)
     if len(known) > MAX_LINES or not np.isfinite(u).all():
-        return u**2, False
+        return u**2
     if result.method == "law":
         law = law_covariance(result)
-        return (u**2, False) if law is None else (_sized(law[1][np.ix_(known, known)], u), True)
+        return u**2 if law is None else _sized(law[1][np.ix_(known, known)], u)
     system = system_behind(result)
     if system is None or not system.angular.n_views:
-        return u**2, False
+        return u**2
     conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
                                 Sense(result.sense), half_width_m(result))
     to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
@@ -101,7 +101,7 @@ def theta_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.n
     if is_flipped(result):
         back = -np.arange(len(known)) % len(known)
         cover = cover[np.ix_(back, back)]
-    return _sized(cover[np.ix_(known, known)], u), True
+    return _sized(cover[np.ix_(known, known)], u)
 
 
 def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _stored(stored: dict[str, Any], kind: str, valid: np.ndarray,
-            known: np.ndarray) -> tuple[np.ndarray, bool]:
+            known: np.ndarray) -> np.ndarray:
     """Return the stored covariance of the known values, which are among the valid ones."""
     n = int(valid.sum())
     try:
@@ -137,7 +137,7 @@ def _stored(stored: dict[str, Any], kind: str, valid: np.ndarray,
     full[np.tril_indices(n)] = values
     full = full + np.tril(full, -1).T
     chosen = known[valid]
-    return full[np.ix_(chosen, chosen)], True
+    return full[np.ix_(chosen, chosen)]
 
 
 def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -154,8 +154,8 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     """
     if COVARIANCE in result.extra or result.method in ("law", COMBINED):
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
-        cover, whole = xy_covariance(result, known)
-        if not whole:
+        cover = xy_covariance(result, known)
+        if cover.ndim == 1:
             return float("nan"), float("nan")
         z = (result.artifact.x_m + 1j * result.artifact.y_m) / pitch_m
         shear = Gauge(z, known, scale=True).shear[:, known]

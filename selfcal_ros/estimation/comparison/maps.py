@@ -121,10 +121,10 @@ class Spread:
         return ratio / np.sqrt(rng.chisquare(self.dof, DRAWS) / self.dof)
 
 
-def of_one_kind(covers: Sequence[tuple[np.ndarray, bool]]) -> list[np.ndarray]:
+def of_one_kind(covers: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return covariances, or all as variances if one of them is not a full matrix."""
-    full = all(whole for _, whole in covers)
-    return [cover if full or cover.ndim == 1 else np.diag(cover) for cover, _ in covers]
+    full = all(cover.ndim == 2 for cover in covers)
+    return [cover if full or cover.ndim == 1 else np.diag(cover) for cover in covers]
 
 
 def significance(values: np.ndarray, spread: Spread) -> Significance | None:
@@ -298,8 +298,7 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
 
 
 def _theta_test(a: CalibrationResult, b: CalibrationResult, d_theta: np.ndarray,
-                covariances: Sequence[Callable[[np.ndarray], tuple[np.ndarray, bool]]]
-                ) -> Significance | None:
+                covariances: Sequence[Callable[[np.ndarray], np.ndarray]]) -> Significance | None:
     known = np.isfinite(d_theta)
     if known.sum() < 2:
         return None

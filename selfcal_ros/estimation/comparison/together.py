@@ -202,27 +202,26 @@ def together(result: CalibrationResult) -> Together | None:
     return found if found is not None and found.marks.any() else None
 
 
-def plate_covariance(result: CalibrationResult, known: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the covariance of Ax, Ay at marks, m^2, and whether it is a full matrix.
+def plate_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
+    """Return the covariance of Ax, Ay at marks, m^2.
 
     (2n, 2n), or the variances (2n,) if the correlations are not kept.
     """
     emap, kept = plate_as_map(result).error_map, together(result)
     if kept is None or not kept.marks[known].all():
-        return np.concatenate([emap.u_gx[known], emap.u_gy[known]]) ** 2, False
+        return np.concatenate([emap.u_gx[known], emap.u_gy[known]]) ** 2
     nowhere = np.zeros(kept.sites.shape, dtype=bool)
-    return kept.cover(nowhere, known)[:-4, :-4], True
+    return kept.cover(nowhere, known)[:-4, :-4]
 
 
-def plate_theta_covariance(result: CalibrationResult, known: np.ndarray
-                           ) -> tuple[np.ndarray, bool]:
+def plate_theta_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
     """Return the covariance of Atheta at lines, rad^2; variances if it is not kept."""
     u, kept = plate_as_map(result).error_map.u_g_theta, together(result)
     lines, cover = (np.zeros((2, 0)), u) if kept is None else kept.lines()
     if not lines.size or not lines[1][known].all():
-        return u[known] ** 2, False
+        return u[known] ** 2
     at = len(u) + np.flatnonzero(known)
-    return cover[np.ix_(at, at)], True
+    return cover[np.ix_(at, at)]
 
 
 def plate_as_map(result: CalibrationResult) -> CalibrationResult:

@@ -268,7 +268,7 @@ def _theta_maps(before: CalibrationResult, after: CalibrationResult, known: np.n
     return _Maps(one, other, *_without_datum(covers, q), q)
 
 
-def _without_datum(covers: list[tuple[np.ndarray, bool]],
+def _without_datum(covers: list[np.ndarray],
                  q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two covariances without the datum's part, as matrices, or both as variances."""
     one, other = (without(cover, q) for cover in of_one_kind(covers))

@@ -56,9 +56,8 @@ def test_covariance_of_a_saved_map(sense, reference):
     result = calibrate(readings, options)
     known = result.error_map.valid
     assert all(np.ndim(view.read_grid) == 0 for view in result.views if view.read_grid is not None)
-    found, correlated = xy_covariance(result, known)
+    found = xy_covariance(result, known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
-    assert correlated
     assert abs(found - wanted).max() < 1e-6 * wanted.max()
 
 
@@ -72,16 +71,15 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     result = calibrate(readings, options)
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
     known = result.error_map.valid
-    found, correlated = xy_covariance(saved, known)
+    found = xy_covariance(saved, known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
-    assert correlated
     assert abs(found - wanted).max() < 1e-4 * wanted.max()
     u = np.concatenate([result.error_map.u_gx[known], result.error_map.u_gy[known]])
     assert np.sqrt(np.diag(wanted)) == pytest.approx(u, rel=1e-6)
     shear = first_order_u(saved)
     assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
     alone = replace(saved, extra={})
-    assert xy_covariance(alone, known)[1] is False
+    assert xy_covariance(alone, known).ndim == 1
     assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
 
 
@@ -114,10 +112,9 @@ def test_without_weights_only_the_variances_are_known():
     result = calibrate(measured(PLAN, 1), BARE)
     emap, bare_views = result.error_map, replace(result, views=tuple(
         replace(v, read_grid=None, read_angular=None) for v in result.views))
-    found, correlated = xy_covariance(bare_views, emap.valid)
-    assert not correlated
+    found = xy_covariance(bare_views, emap.valid)
     assert found.tolist() == [*(emap.u_gx[emap.valid]**2), *(emap.u_gy[emap.valid]**2)]
-    assert theta_covariance(bare_views, np.isfinite(emap.g_theta))[1] is False
+    assert theta_covariance(bare_views, np.isfinite(emap.g_theta)).ndim == 1
     assert np.isnan(first_order_u(bare_views)).all()
 
 
@@ -144,13 +141,11 @@ def require_covariances(result, answers, *, theta=1e-6):
     """Require the covariances of a saved result to be those of every reading moved in turn."""
     sites = result.artifact.shape[0] * result.artifact.shape[1]
     of_readings = answers.T @ answers
-    for found, wanted, tolerance in (
+    for covariance, wanted, tolerance in (
             (xy_covariance(result, result.error_map.valid),
              of_readings[:2 * sites, :2 * sites], 1e-6),
             (theta_covariance(result, np.isfinite(result.error_map.g_theta)),
              of_readings[2 * sites:, 2 * sites:], theta)):
-        covariance, correlated = found
-        assert correlated
         assert abs(covariance - wanted).max() < tolerance * wanted.max()
 
 
