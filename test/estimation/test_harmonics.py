@@ -14,11 +14,13 @@ from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.lattice.readings import angular_data
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.rank import best_turn_deg
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.validation import prediction_errors
+from selfcal_ros.estimation.quality.prediction import line_errors
 from selfcal_ros.estimation.recheck.views import line_rows
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
@@ -127,7 +129,8 @@ def test_the_axis_is_where_it_stood_not_where_it_was_to_stand(sense, follow):
     result = calibrate(readings, BARE)
     # the axis is taken where it stood for the mean line: lines scatter by some 2e-4 rad
     assert np.abs(error_of(result, truth)).max() < 3e-8
-    errors = prediction_errors(readings, result, 3, readings.views[3], rigid=True)[1]
+    lines = angular_data(readings)
+    errors = line_errors(solve_joint(readings, BARE), lines)[lines.index.index(3)]
     assert np.abs(errors).max() < 1e-7
     nominal = replace(readings, views=tuple(
         replace(view, axis_theta=0.0) for view in readings.views))
@@ -257,10 +260,10 @@ def test_a_result_keeps_its_harmonics_and_is_compared_with_its_covariance():
 
 def test_readings_held_out_are_predicted_between_the_lines():
     readings = measured(plan(24, 8), sigma_rad=0.0)[1]
-    result = calibrate(readings, BARE)
-    for index in (0, 3, 4):
-        _, theta = prediction_errors(readings, result, index, readings.views[index])
-        assert len(theta) == 24 and np.abs(theta - theta.mean()).max() < 1e-10
+    errors = line_errors(solve_joint(readings, BARE), angular_data(readings))
+    assert errors.shape == (3, 24)
+    for theta in errors:
+        assert np.abs(theta - theta.mean()).max() < 1e-10
 
 
 @pytest.mark.parametrize(("count", "harmonics", "message"), [

@@ -50,6 +50,19 @@ class Solved:
     axes: tuple[float, float] = (1.0, 0.0)
     converged: bool = True
 
+    @property
+    def joint(self) -> ModelFit:
+        """The joint fit, of a solution that has one.
+
+        Raises
+        ------
+        ValueError
+            For Hu's law.
+        """
+        if self.model is None:
+            raise ValueError("the solution has no joint fit")
+        return self.model
+
 
 def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:
     """Return the noises of a result."""

@@ -14,11 +14,7 @@ from math import ceil
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.readings import pose_of
-from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.readings import ViewReadings
-from selfcal_ros.model.result import ArtifactMap
 
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
@@ -172,20 +168,6 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
         out[:, v, 0] = (0, 0, -1, 0, 0, 0, -1)
         out[:, v, 1], out[:, v, 2] = np.real(taus), np.imag(taus)
     return out
-
-
-def turned_marks(view: ViewReadings, artifact: Artifact) -> np.ndarray:
-    """Return R^q m of the marks read, from the plate's centre, complex (P,), stage frame, m."""
-    turn = pose_of(view.view, artifact).phase
-    x, y = artifact.places(view.m, view.n)
-    return turn * (x + 1j * y) * artifact.grid_pitch_m
-
-
-def turned_plate(view: ViewReadings, artifact: Artifact, plate: ArtifactMap) -> np.ndarray:
-    """Return R^q A of the marks read, complex (P,), stage frame, m; NaN where unknown."""
-    turn = pose_of(view.view, artifact).phase
-    at = artifact.index(view.m, view.n)
-    return turn * (plate.ax[at] + 1j * plate.ay[at])
 
 
 def rotation_excess(phi_rad: float, marks: np.ndarray, plate: np.ndarray) -> np.ndarray:

@@ -18,13 +18,16 @@ from scipy.special import fdtri
 
 from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.placed import maps_of
-from selfcal_ros.estimation.lattice.readings import GridData, grid_data
+from selfcal_ros.estimation.lattice.readings import AngularData, GridData, grid_data
+from selfcal_ros.estimation.normal.systems import Marks, lines_of
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.projection import reduce_columns
-from selfcal_ros.estimation.terms.shapes import shapes_in_full
+from selfcal_ros.estimation.terms.shapes import NO_LINES, shapes_in_full
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.readings import Measurements
@@ -39,6 +42,9 @@ READINGS_DRAWN = 2_000_000
 """Largest number of readings in all draws together: larger fields vary less."""
 
 MIN_DRAWS = 16
+
+RIGID_STEPS = 8
+"""Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
 
 TOGETHER = 20_000
 """Number of readings computed at once: several draws of a small field, one of a large one."""
@@ -124,48 +130,63 @@ def _in_time_of(ground: TermInputs, grid: GridData, kept: Measurements,
     return replace(ground, visits=tuple(visits))
 
 
-def of_terms(model: ModelFit, held: HeldReadings, index: int,
-             view_marks: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the effect of terms and stage positions on the held readings of a view, stage frame.
+def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
+    """Return the errors of prediction of held grid readings, complex (views, nx, ny), m.
 
-    Complex (P,).
-
-    Parameters
-    ----------
-    model : ModelFit
-        The fit.
-    held : HeldReadings
-        Readings that were held out.
-    index : int
-        Position of the view in the measurement.
-    view_marks : tuple of int array (P,)
-        Lattice indices of its marks, from 0.
+    Plate frame; NaN where a mark was not held, or cannot be predicted. A misalignment that the
+    solution does not know is that which fits the errors best.
     """
-    if index not in held.grid.index:
-        return np.zeros(len(view_marks[0]), dtype=complex)
-    row = held.grid.index.index(index)
-    plate = held.moved[row] + np.tensordot(model.coefficients, held.columns[:, row], axes=1)
-    return plate[view_marks] * held.grid.poses[row].phase
+    model, result = solved.joint, solved.result
+    problem, system = model.problem, model.problem.system
+    views = maps_of(system.grid.views.plate_shape, held.grid.poses)
+    known = (held.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
+    plate, marks = model.found.plate, views.z * problem.half_width_m
+    error = held.grid.y - held.moved - np.tensordot(model.coefficients, held.columns, axes=1)
+    error = np.where(known, error - views.gather(model.found.field) - plate, complex(np.nan))
+    for one, here, index, pose in zip(error, known, held.grid.index, held.grid.poses, strict=True):
+        view = result.views[index]
+        phi, tau = view.phi, complex(view.tx, view.ty) * pose.phase.conjugate()
+        if not np.isfinite([phi, view.tx, view.ty]).all():
+            phi, tau = _fitted_placing(one[here], marks[here], plate[here],
+                                       steps=RIGID_STEPS if problem.rigid else 0)
+        if problem.rigid:
+            one -= rotation_excess(phi, marks, plate)
+        one -= 1j * phi * marks + tau
+    return error
 
 
-def of_line_terms(model: ModelFit, index: int, k: np.ndarray) -> np.ndarray:
-    """Return the effect of the terms on the lines `k` of one view, (Q,), rad.
+def _fitted_placing(errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *,
+                    steps: int) -> tuple[float, complex]:
+    """Return rotation, rad, and offset, plate frame, m, that fit errors; NaN of too few, (P,)."""
+    if len(errors) < 3:
+        return np.nan, complex(np.nan)
+    phi, x, y = fitted_misalignment(marks, errors[:, None])[:, 0]
+    for _ in range(steps):
+        rest = errors - rotation_excess(phi, marks, plate)
+        phi, x, y = fitted_misalignment(marks, rest[:, None])[:, 0]
+    return float(phi), complex(x, y)
 
-    Parameters
-    ----------
-    model : ModelFit
-        The fit.
-    index : int
-        Position of the view in the measurement; the effect is 0 if none of its lines was fitted.
-    k : int array (Q,)
-        The lines.
+
+def line_errors(solved: Solved, held: AngularData) -> np.ndarray:
+    """Return the errors of prediction of held readings of lines, (views, K), rad.
+
+    As of `prediction_errors`; of terms of the lines where any line of their view was fitted.
     """
-    if model.equations is None or index not in model.problem.angular.index:
-        return np.zeros(len(k))
-    lines, row = model.equations.columns.lines, model.problem.angular.index.index(index)
-    if not len(lines.at):
-        return np.zeros(len(k))
-    return model.coefficients[lines.at] @ lines.values[:, row, k]
+    model = solved.joint
+    system, found, fitted = model.problem.system, model.found, model.problem.angular.index
+    field = np.where(system.known_lines, found.g_theta, np.nan)
+    plate = np.where((held.weight > 0) & system.known_plate_lines, found.a_theta, np.nan)
+    lines = lines_of(Marks(held.turns, held.weight, held.index, held.harmonics))
+    error = held.y - lines.gather(field) - plate
+    terms = NO_LINES if model.equations is None else model.equations.columns.lines
+    for one, index in zip(error, held.index, strict=True):
+        if index in fitted and len(terms.at):
+            one -= model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
+        phi = solved.result.views[index].phi
+        if not np.isfinite(phi) and np.isfinite(one).any():
+            phi = np.nanmean(one)
+        one -= phi
+    return error
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.compensation.circle import Circle
 from selfcal_ros.errors import (
     InputError,
     NoDataError,
     NotIdentifiableError,
     NotSettledError,
 )
-from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.lattice.maps import rotation_excess, turned_marks, turned_plate
-from selfcal_ros.estimation.lattice.placed import maps_of
-from selfcal_ros.estimation.lattice.readings import pose_of
+from selfcal_ros.estimation.lattice.readings import angular_data, pose_of
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
@@ -34,14 +30,13 @@ from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.prediction import (
     HeldReadings,
-    fitted_misalignment,
     held_readings,
-    of_line_terms,
-    of_terms,
+    line_errors,
+    prediction_errors,
     prediction_limit,
 )
 from selfcal_ros.model.error_map import ThetaDatum, rms
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings, subset
+from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
@@ -49,9 +44,6 @@ from selfcal_ros.model.view import Plan
 MAX_FOLDS = 10
 
 NOTHING = float("nan")
-
-RIGID_STEPS = 8
-"""Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
 
 
 @dataclass(frozen=True)
@@ -153,41 +145,23 @@ def _held_out(measurements: Measurements, options: Options,
         return HeldOut(why=_rest_not_identified(kept, held))
     except NotSettledError:
         return HeldOut(why=Finding("rest_not_converged"))
-    model = solved.model
-    if model is None:
-        raise AssertionError("the joint solution always has its model")
-    of = held_readings(model, kept, held)
-    rigid = options.misalignment_model == "rigid"
-    errors, angles = [], []
-    known_at, error_at = np.zeros(of.grid.weight.shape, dtype=bool), np.zeros_like(of.grid.y)
-    for index, view in enumerate(held.views):
-        at = measurements.artifact.index(view.m, view.n)
-        more = of_terms(model, of, index, at)
-        less = replace(view, dx=view.dx - more.real, dy=view.dy - more.imag,
-                       dtheta=view.dtheta - of_line_terms(model, index, view.k))
-        residual, residual_theta = prediction_errors(measurements, solved.result, index, less,
-                                                     rigid=rigid)
-        errors.append(residual)
-        angles.append(residual_theta)
-        if index in of.grid.index:
-            row, good = of.grid.index.index(index), np.isfinite(residual).all(axis=0)
-            known_at[row][at] = good
-            error_at[row][at] = np.where(good, residual[0] + 1j * residual[1], 0.0)
-    both, lines_off = np.concatenate(errors, axis=1), np.concatenate(angles)
-    both = both[:, np.isfinite(both).all(axis=0)]
-    lines_off = lines_off[np.isfinite(lines_off)]
+    of = held_readings(solved.joint, kept, held)
+    error, angles = prediction_errors(solved, of), line_errors(solved, angular_data(held))
+    known = np.isfinite(error)
+    both = np.stack([error[known].real, error[known].imag])
+    lines_off = angles[np.isfinite(angles)]
     if not both.size and not lines_off.size:
         return HeldOut(why=Finding("nothing_to_predict"))
-    ratio, limit, why = _judged(solved, model, of, known=known_at, error=error_at)
+    ratio, limit, why = _judged(solved, of, known=known, error=error)
     return HeldOut("", 0, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
                    float(abs(both).max()) if both.size else NOTHING,
                    rms(lines_off) if lines_off.size else NOTHING, ratio, why, limit)
 
 
-def _judged(solved: Solved, model: ModelFit, held: HeldReadings, *, known: np.ndarray,
+def _judged(solved: Solved, held: HeldReadings, *, known: np.ndarray,
             error: np.ndarray) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""
-    noise = solved.result.noise
+    noise, model = solved.result.noise, solved.joint
     if not known.any():
         return NOTHING, NOTHING, None
     weight = held.grid.weight
@@ -221,93 +195,6 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
                 "translation_y": more.translation_m[1], "grid": more.grid,
                 "angular": more.angular}})
     return Finding("rest_not_identified")
-
-
-def prediction_errors(measurements: Measurements, result: CalibrationResult, index: int,
-                      view: ViewReadings, *, rigid: bool = False
-                      ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the prediction errors of the readings `view`, (2, P) in m and (Q,) in rad.
-
-    Parameters
-    ----------
-    measurements : Measurements
-        For the plate and the sense.
-    result : CalibrationResult
-        Calibration without these readings.
-    index : int
-        Position of the view in the calibration, for its misalignment; a misalignment that is
-        not known there is fitted to the readings.
-    view : ViewReadings
-        Readings that are predicted.
-    rigid : bool
-        Whether the calibration took finite rotations of the plate.
-    """
-    known = result.views[index]
-    grid = _aligned(_grid_errors(measurements, result, view), measurements, result, view,
-                    known=(known.phi, known.tx, known.ty), rigid=rigid)
-    theta = np.zeros(0)
-    if len(view.k):
-        sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
-        count = measurements.artifact.angular_count
-        turn = pose_of(view.view, measurements.artifact).turn_lines or 0
-        site, g = sign * (view.k + turn) % count, result.error_map.g_theta
-        if harmonics := measurements.artifact.harmonics:
-            g_theta = Circle(g, cubic=False, harmonics=harmonics).at(
-                site * (2 * np.pi / count) + sign * view.axis_theta)
-        else:
-            g_theta = g[site]
-        theta = (view.dtheta - sign * g_theta
-                 - result.artifact_map.a_theta[view.k])
-        phi = known.phi
-        if not np.isfinite(phi):
-            phi = np.nanmean(theta) if np.isfinite(theta).any() else np.nan
-        theta = theta - phi
-    return grid, theta
-
-
-def _grid_errors(measurements: Measurements, result: CalibrationResult,
-                 view: ViewReadings) -> np.ndarray:
-    """Return the readings minus stage and plate error, complex (P,); NaN where one is unknown."""
-    if not len(view.m):
-        return np.zeros(0, dtype=complex)
-    artifact, emap = measurements.artifact, result.error_map
-    field = emap.gx + 1j * emap.gy
-    if measurements.sense is Sense.PLATE_MOVES:
-        field = -field[::-1, ::-1]
-    pose = pose_of(view.view, artifact)
-    at_marks = pose.phase * maps_of(artifact.shape, (pose,)).gather(field)[0]
-    at = artifact.index(view.m, view.n)
-    return (view.dx + 1j * view.dy - at_marks[at]
-            - turned_plate(view, artifact, result.artifact_map))
-
-
-def _aligned(residual: np.ndarray, measurements: Measurements, result: CalibrationResult,
-             view: ViewReadings, *, known: tuple[float, float, float], rigid: bool) -> np.ndarray:
-    """Return `residual` minus the misalignment, known or fitted to `residual` itself, (2, P)."""
-    if not residual.size:
-        return np.zeros((2, 0))
-    artifact = measurements.artifact
-    marks = turned_marks(view, artifact)
-    plate = turned_plate(view, artifact, result.artifact_map)
-    if np.isfinite(known).all():
-        phi, tx, ty = known
-    else:
-        phi, tx, ty = _misalignment(residual, marks)
-        for _ in range(RIGID_STEPS if rigid else 0):
-            phi, tx, ty = _misalignment(residual - rotation_excess(phi, marks, plate), marks)
-    if rigid:
-        residual = residual - rotation_excess(phi, marks, plate)
-    rest = residual - 1j * phi * marks - complex(tx, ty)
-    return np.stack([rest.real, rest.imag])
-
-
-def _misalignment(residual: np.ndarray, marks: np.ndarray) -> tuple[float, float, float]:
-    """Fit (phi, tx, ty) to `residual`; NaN if fewer than three marks are known."""
-    good = np.isfinite(residual)
-    if good.sum() < 3:
-        return (float("nan"),) * 3
-    phi, tx, ty = fitted_misalignment(marks[good], residual[good, None])[:, 0]
-    return float(phi), float(tx), float(ty)
 
 
 def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:

@@ -14,7 +14,6 @@ import numpy as np
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.finer import finer
-from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.joint.solved import Solved
 from selfcal_ros.estimation.options import Options
@@ -114,7 +113,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
         _search(found, measurements, options, failed=failed)
-    solved, tests = found.solved, _model(found.solved).sizes
+    solved, tests = found.solved, found.solved.joint.sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
               if test.contradicted and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
@@ -123,12 +122,12 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     between = any(block_of(name).between for name in raised)
     alike = between and _as_a_microscope(found, measurements, options)
     found.causes[:0] = [cause for cause in raised.values() if cause is not None]
-    turned = turned_too_far(_model(solved), solved.result, measurements)
+    turned = turned_too_far(solved.joint, solved.result, measurements)
     if turned is not None:
         found.bounded = False
         if turned.name not in [cause.name for cause in found.causes]:
             found.causes.append(turned)
-    for rough in filter(None, (adequacy_of(_model(solved)), line_adequacy_of(_model(solved)))):
+    for rough in filter(None, (adequacy_of(solved.joint), line_adequacy_of(solved.joint))):
         found.effects.append(rough.effect(solved.result))
         if (cause := rough.cause) is not None:
             nodes = _better_map(measurements, options) if advise and not rough.of_lines else ""
@@ -186,7 +185,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
     Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
     contradicts them, the one with the smaller uncertainty.
     """
-    used = {term.name: term for term in _model(searched.solved).problem.terms}
+    used = {term.name: term for term in searched.solved.joint.problem.terms}
     best, least = None, np.inf
     for free in (True, False):
         terms = [ModelTerm(name) if free else used[name].rounded_up
@@ -243,7 +242,7 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
         failed = False
     for item in left:
         _bound(found, item, measurements)
-    if (line := line_cause(_model(found.solved), measurements, CAUSE_LEVEL)) is not None:
+    if (line := line_cause(found.solved.joint, measurements, CAUSE_LEVEL)) is not None:
         found.causes.append(line)
         lines = measurements.artifact.angular_count  # the error of a reading at most
         found.effects.append(Effect(
@@ -253,15 +252,9 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
         _noisy_views(found, measurements)
 
 
-def _model(solved: Solved) -> ModelFit:
-    if solved.model is None:
-        raise ValueError("the solution has no joint fit")
-    return solved.model
-
-
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
-    model = _model(solved)
+    model = solved.joint
     found = [item for item in find_explanations(model, slips=False)
              if failed or _counts(item, solved)]
     if found or failed:
@@ -305,11 +298,11 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
 
     Return whether it joined.
     """
-    ground = _model(found.solved).problem.ground
+    ground = found.solved.joint.problem.ground
     names = [*found.terms, first[0].name]
     solved = solved_with(measurements, options, [_hardly(n) for n in names])
     if solved is None or not any(test.name == first[0].name and test.contradicted
-                                 for test in _model(solved).sizes):
+                                 for test in solved.joint.sizes):
         return False
     for other in first[1:]:
         twin = solved_with(measurements, options, [
@@ -319,7 +312,7 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
     found.causes += [cause_of(item, ground) for item in first]
     found.solved, found.terms = solved, names
     found.causes[-len(first)] = cause_of(fitted_term(
-        _model(solved), first[0].name, first[0].p, whole=first[0].whole), ground)
+        solved.joint, first[0].name, first[0].p, whole=first[0].whole), ground)
     return True
 
 
@@ -331,12 +324,12 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
     # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
-    held = fitted_term(_model(solved), term.name, test.p,
+    held = fitted_term(solved.joint, term.name, test.p,
                    whole=little or test.rank == len(term.estimates))
     if not _counts(held, solved):
         return None
     if block_of(test.name).between and abs(
-            (cause := cause_of(held, _model(solved).problem.ground)).size) > SURE * cause.u:
+            (cause := cause_of(held, solved.joint.problem.ground)).size) > SURE * cause.u:
         return cause  # otherwise the readings do not determine which view it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
@@ -365,21 +358,21 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
         return False
     wider = known.scaled(max(known.block.plausible / known.size, 1.0))
     twin = solved_with(measurements, options, [wider])
-    if twin is None or any(test.contradicted for test in _model(twin).sizes):
+    if twin is None or any(test.contradicted for test in twin.joint.sizes):
         return False
-    held = fitted_term(_model(twin), known.name)
+    held = fitted_term(twin.joint, known.name)
     effect = difference(str(known.name), twin.result, found.solved.result)
     if not _counts(replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
                    found.solved):
         return False
-    found.causes.append(cause_of(held, _model(twin).problem.ground))
+    found.causes.append(cause_of(held, twin.joint.problem.ground))
     found.effects.append(effect)
     return True
 
 
 def _bound(found: SearchResult, item: Explanation, measurements: Measurements) -> None:
     """Add a cause outside the model, with its effect on the map as far as determined."""
-    model = _model(found.solved)
+    model = found.solved.joint
     cause = cause_of(item, model.problem.ground)
     if cause.name in [known.name for known in found.causes] and cause.name in blocks():
         return
@@ -395,7 +388,7 @@ def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
 
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
-    views = scatter_of_views(_model(found.solved), measurements)
+    views = scatter_of_views(found.solved.joint, measurements)
     emap, noisy = found.solved.result.error_map, noisier_views(views)
     largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
     if (ratio := largest / found.solved.xy.sigma) > 1:
