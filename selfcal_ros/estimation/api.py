@@ -10,6 +10,7 @@ from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
 from selfcal_ros.estimation.checks.turned import (
+    AS_IS,
     OTHER_LINES,
     PAIRS,
     Turned,
@@ -181,6 +182,10 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
         result = judged(*found, options, advise=False).result
         return _agree(result) or (contradicted and options.finite_rotations and _fits(result))
 
+    if not options.finite_rotations:  # a linear model mistakes rotations for a wrong wiring
+        options = replace(options, misalignment_model="rigid")
+        if agree(AS_IS, options):
+            return
     plain = replace(options, causes=False)
     shown = sign_is_shown(measurements)  # repeats beside the marks
     fitting = [] if shown else [pair for pair in PAIRS if any(agree(one, plain) for one in pair)]

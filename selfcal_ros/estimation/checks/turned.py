@@ -36,6 +36,7 @@ class Turned:
 
 
 TURN, MIRROR = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
+AS_IS = Turned(np.eye(2), 1, "the offsets are as they are published")
 OTHER_LINES = Turned(np.eye(2), -1, "offset_theta has the other sign, or the offsets are turned "
                      "by 180°")
 PAIRS = (

@@ -213,14 +213,14 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
     effects. `solved` itself if no search is wanted, or there is no other solution.
     """
     nx, ny = measurements.artifact.shape
-    wanted = failed or (solved.model is None and nx * ny <= ALWAYS_SITES)
+    wanted = failed or nx * ny <= ALWAYS_SITES
     if options.causes is False or not wanted or options.misalignment_model != "linear":
         return solved
     try:
         linear = solved if solved.model is not None else solve_joint(
             measurements, replace(options, method="joint", misalignment_model="linear",
                                   at_places=False))  # as the law has them
-        rigid = linear if not failed else solve_joint(
+        rigid = solve_joint(
             measurements, replace(options, method="joint", misalignment_model="rigid"))
     except InputError:
         return solved

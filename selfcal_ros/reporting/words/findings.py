@@ -176,8 +176,8 @@ SENTENCES: dict[str, Words] = {
         "readings do not fit: check the sense, the axes and the pixel size of the microscope"),
     "finite_rotation": lambda f, of: (
         f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
-        "solve jointly with finite rotations, the default, which leaves "
-        f"{of['residuals'] * UM_PER_M:.3g} µm"),
+        "leave out --misalignment linear (or --method law); solved jointly with finite rotations, "
+        f"the default, the readings leave {of['residuals'] * UM_PER_M:.3g} µm"),
     "view_left_out": lambda f, of: (
         f"view '{f.view}' is not part of the map: none of its detections became a reading ("
         + ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items()) + ")"),

@@ -9,6 +9,7 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -24,8 +25,8 @@ LINEAR = [bare(method="law"), bare(misalignment_model="linear")]
 NAMES = ["law", "linear"]
 
 
-def judged(options, spread=FLAT, **how):
-    plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
+def judged(options, spread=FLAT, *, repeats=5, **how):
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), repeats), np.random.default_rng(3)
     truth = random_truth(plan.artifact, 4, rng, spread)
     readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
                                      visits=True)
@@ -48,8 +49,23 @@ def test_a_plate_that_really_turns_is_told_with_its_largest_turn(options):
     head, _, tail = found.verdict.reasons[0].partition(" mrad")
     assert head.startswith("the model is linear, but the plate was turned by up to ")
     assert float(head.rpartition(" ")[2]) == pytest.approx(largest, abs=0.02)
-    assert "solve jointly with finite rotations" in tail
+    assert "leave out --misalignment linear" in tail
     assert found.verdict.sentence == f"Not qualified: {found.verdict.reasons[0]}"
+
+
+@pytest.mark.parametrize(("options", "repeats"), [
+    (bare(misalignment_model="linear"), 1), (bare(method="law"), 1),
+    (Options(misalignment_model="linear",
+             terms=(ModelTerm("microscope"), ModelTerm("drift"))), 2)])
+def test_rotations_are_named_where_nothing_tells_the_noise_or_terms_take_them_up(options, repeats):
+    """A turned microscope, strain, and lines of the other sign were named instead."""
+    verdict = judged(options, replace(FLAT, phi_rad=1e-2), repeats=repeats, servo_sigma_m=1e-7)[
+        1].verdict
+    assert verdict.grade is Grade.NOT_QUALIFIED and not verdict.causes
+    assert "the plate was turned by up to" in verdict.sentence
+    default = replace(options, method="joint", misalignment_model="rigid")
+    assert judged(default, replace(FLAT, phi_rad=1e-2), repeats=repeats, servo_sigma_m=1e-7)[
+        1].verdict.grade is Grade.GOOD
 
 
 @pytest.mark.parametrize("options", LINEAR, ids=NAMES)

@@ -171,8 +171,9 @@ FINDINGS = [
      "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is not "
      "known; read every mark twice"),
     (Finding("finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}),
-     "the model is linear, but the plate was turned by up to 5.13 mrad: solve jointly with finite "
-     "rotations, the default, which leaves 0.0204 µm"),
+     "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
+     "--misalignment linear (or --method law); solved jointly with finite rotations, the default, "
+     "the readings leave 0.0204 µm"),
     (Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=0.0012),
      "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure 3 "
      "arcsec, p = 0.0012); use zero_mean"),
