@@ -28,56 +28,70 @@ from selfcal_ros.sessions.sequencing import SequencingSession
 class CalibrationAction:
     """Serve run_calibration for a sequencer: one goal at a time, none while it is not active.
 
+    It is offered as long as the node exists: a goal is answered in every state, and the result of
+    one that the node's cleanup ends is still sent.
+
     Parameters
     ----------
     node : ManagedNode
-        The sequencer's node, during configuration.
-    session : SequencingSession
-        Runs the plan.
+        The sequencer's node.
     """
 
-    def __init__(self, node: ManagedNode[SequencerSettings], session: SequencingSession) -> None:
-        self._node, self._session = node, session
+    def __init__(self, node: ManagedNode[SequencerSettings]) -> None:
+        self._node = node
+        self._session: SequencingSession | None = None
+        self._saver: Any = None
         self._taken = False  # from the acceptance of a goal, before it is executed, to its end
         self._goal: Any = None
         self._feedback: Any = None  # of this goal, the last
         self._ended: Future | None = None
         self._saved: Future | None = None
         self._save_until = 0.0
-        session.on_end = lambda: _complete(self._ended)
-        self._saver = node.own(node.create_client(SaveMap, "solver/save_map"),
-                               node.destroy_client)
-        node.own(ActionServer(
+        server = ActionServer(
             node, RunCalibration, "~/run_calibration", self._execute,
             goal_callback=self._on_goal, handle_accepted_callback=self._on_accepted,
-            cancel_callback=lambda goal: CancelResponse.ACCEPT),
-            ActionServer.destroy)
+            cancel_callback=lambda goal: CancelResponse.ACCEPT)
+        self.destroy = server.destroy
+
+    def serve(self, session: SequencingSession) -> None:
+        """Execute goals with a session, until the configuration of the node is undone."""
+        self._session = session
+        session.on_end = lambda: _complete(self._ended)
+        self._saver = self._node.own(self._node.create_client(SaveMap, "solver/save_map"),
+                                     self._node.destroy_client)
+        self._node.own(None, lambda _: self._leave())
+
+    def _leave(self) -> None:
+        """End the goal in execution, whose plan is not measured to its end."""
+        self._session = None
+        _complete(self._ended)
+        _complete(self._saved)
 
     def tick(self) -> None:
         """Give changed feedback; handle a cancelled goal and a solver that does not answer."""
-        if self._goal is None:
+        session = self._session
+        if self._goal is None or session is None:
             return
-        if self._goal.is_cancel_requested and not self._session.ended:
-            self._session.give_up()
+        if self._goal.is_cancel_requested and not session.ended:
+            session.give_up()
         if time.monotonic() > self._save_until:
             _complete(self._saved)
-        view = self._session.current
+        view = session.current
         if view is None:
             return
         feedback = RunCalibration.Feedback(
-            view=view.name, view_index=self._session.machine.index,
-            coverage=self._session.coverage)
+            view=view.name, view_index=session.machine.index, coverage=session.coverage)
         if feedback != self._feedback:
             self._feedback = feedback
             self._goal.publish_feedback(feedback)
 
     def _on_goal(self, _: Any) -> GoalResponse:
-        active = self._node.state == "active"
-        if active and self._session.ended and not self._taken:
+        session = self._session if self._node.state == "active" else None
+        if session is not None and session.ended and not self._taken:
             return GoalResponse.ACCEPT
-        why = (f"the node is {self._node.state}: activate it first" if not active else
+        why = (f"the node is {self._node.state}: activate it first" if session is None else
                "another one is executed: cancel it, or wait for its end" if self._taken else
-               f"{self._session.machine.state}: abort the plan first")
+               f"{session.machine.state}: abort the plan first")
         self._node.say(Level.WARN, f"goal rejected while {why}")
         return GoalResponse.REJECT
 
@@ -93,12 +107,13 @@ class CalibrationAction:
         """Run the plan of a goal to its end and have the solver save the map."""
         result = RunCalibration.Result()
         try:
+            session: SequencingSession = self._node.session
             if goal.request.plan_path:
-                self._session.machine.plan = read_plan(goal.request.plan_path)
+                session.machine.plan = read_plan(goal.request.plan_path)
             self._goal, self._ended, self._feedback = goal, Future(), None
-            self._session.begin()
-            await self._ended
-            await self._conclude(goal, result)
+            session.begin()
+            await self._until(self._ended, session)
+            await self._conclude(goal, result, session)
         except Exception as error:
             code, result.message = as_answer(error)
             result.error_code = int(code)
@@ -107,15 +122,24 @@ class CalibrationAction:
             self._goal, self._ended, self._taken = None, None, False
         return result
 
-    async def _conclude(self, goal: Any, result: Any) -> None:
-        machine = self._session.machine
+    async def _until(self, future: Future, session: SequencingSession) -> None:
+        """Wait for a future; NoDataError if the session has been cleaned up meanwhile."""
+        await future
+        if session is not self._session:
+            raise NoDataError(
+                "run_calibration", "pose_sequencer was cleaned up before the map was saved",
+                "call solver/save_map" if session.machine.state is State.DONE else
+                "activate it again: its service start resumes the plan")
+
+    async def _conclude(self, goal: Any, result: Any, session: SequencingSession) -> None:
+        machine = session.machine
         if machine.state is not State.DONE:
             result.error_code = int(ExitCode.NO_DATA)
             result.message = f"the plan was not measured to its end: {machine.state}"
             goal.canceled() if goal.is_cancel_requested else goal.abort()
             return
-        answer = await self._save(
-            self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id))
+        answer = await self._save(session, self._node.settings.result_path
+                                  or plan_file_name(machine.need_plan().plan_id))
         result.message, result.map_path = answer.message, answer.path
         if answer.success:
             result.error_code = int(ExitCode.DONE)
@@ -124,7 +148,7 @@ class CalibrationAction:
             result.error_code = answer.error_code or int(ExitCode.INTERNAL)
             goal.abort()
 
-    async def _save(self, path: str) -> Any:
+    async def _save(self, session: SequencingSession, path: str) -> Any:
         """Return the solver's answer; NoDataError after a time-out."""
         if not self._saver.service_is_ready():
             raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
@@ -133,7 +157,7 @@ class CalibrationAction:
         answer = self._saver.call_async(SaveMap.Request(path=path))
         answer.add_done_callback(self._node.guarded(lambda _: _complete(self._saved)))
         try:
-            await self._saved
+            await self._until(self._saved, session)
         finally:
             self._saved = None
         if not answer.done():
@@ -156,20 +180,23 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
     """Publish PLACE and MEASURE for each view, driven by services and an action."""
 
     session = WhileConfigured[SequencingSession]()
-    _action = WhileConfigured[CalibrationAction]()
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(SequencerSettings, **kwargs)
+        self._action = CalibrationAction(self)
 
     def configure(self) -> None:
-        """Create the session, with its plan, the publisher of commands, and the action.
-
-        Without a server of the action, a goal would wait for an answer until the activation.
-        """
+        """Create the session, with its plan, and the publisher of commands."""
         command = self.output(names.NEWEST_COMMAND)
         self.session = SequencingSession(
             self.settings, self.ports(lambda _, fields: command(fields)))
-        self._action = CalibrationAction(self, self.session)
+        self._action.serve(self.session)
+
+    def destroy_node(self) -> None:
+        """Undo everything, the action included."""
+        if hasattr(self, "_action"):  # with parameters that were not refused
+            self._action.destroy()
+        super().destroy_node()
 
     def activate(self) -> None:
         """Subscribe to the companions, offer services."""

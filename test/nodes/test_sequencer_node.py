@@ -327,6 +327,13 @@ def test_a_second_goal_is_rejected_and_the_first_goes_on(actor):
 
 def test_a_goal_is_rejected_while_the_node_is_not_active(actor, capfd):
     """Without a server nobody answered it until the node was active again."""
+    for step in ("deactivate", "cleanup"):
+        getattr(actor.node, f"trigger_{step}")()
+    assert not actor.send().accepted
+    said = "goal rejected while the node is unconfigured: activate it first"
+    assert said in capfd.readouterr().err
+    actor.node.trigger_configure()
+    actor.node.trigger_activate()
     actor.node.trigger_deactivate()
     assert not actor.send().accepted
     assert "goal rejected while the node is inactive: activate it first" in capfd.readouterr().err
@@ -384,21 +391,25 @@ def test_a_result_has_code_0_only_if_it_is_done(actor):
     assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, 1)
 
 
+class Hung:
+    """A solver's service that does not answer."""
+
+    def __init__(self) -> None:
+        self.held: list[Future] = []
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request):
+        self.held.append(Future())
+        return self.held[-1]
+
+    def remove_pending_request(self, future) -> None:
+        assert future is self.held[-1]
+
+
 def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     actor = Actor(graph, tmp_path, save_timeout=0.1)
-    held = []
-
-    class Hung:
-        def service_is_ready(self):
-            return True
-
-        def call_async(self, request):
-            held.append(Future())
-            return held[0]
-
-        def remove_pending_request(self, future):
-            assert future is held[0]
-
     actor.node._action._saver = Hung()
     handle = actor.send()
     actor.measure_all()
@@ -407,6 +418,33 @@ def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     assert (result.error_code, result.map_path) == (4, "")
     assert result.message == ("run_calibration: the solver has not saved the map in 0.1 s; check "
                               "the solver, then call save_map")
+
+
+@pytest.mark.parametrize("undone", [["deactivate", "cleanup"], ["shutdown"],
+                                    ["deactivate", "cleanup", "configure", "activate"]])
+@pytest.mark.parametrize("saving", [False, True], ids=["measuring", "saving"])
+def test_a_goal_ends_with_a_result_when_the_node_is_cleaned_up(actor, undone, saving):
+    """Its client waited for ever."""
+    hung = actor.node._action._saver = Hung()
+    handle = actor.send()
+    if saving:
+        actor.measure_all()
+        actor.graph.until(lambda: hung.held, "the request to save")
+    else:
+        actor.graph.until(lambda: (MEASURE, 0) in actor.commands, "the first view")
+    for step in undone:
+        getattr(actor.node, f"trigger_{step}")()
+    status, result = actor.result(handle)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, 4)
+    assert result.message == (
+        "run_calibration: pose_sequencer was cleaned up before the map was saved; "
+        + ("call solver/save_map" if saving else
+           "activate it again: its service start resumes the plan"))
+    if "activate" in undone:
+        actor.heard.clear()
+        later = actor.send()
+        actor.measure_all()
+        assert actor.result(later)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
 def test_a_status_of_before_the_command_does_not_complete_a_redone_view(desk):
