@@ -32,6 +32,9 @@ from selfcal_ros.model.error_map import ErrorMap, error_halfway, share_between
 GENTLE = 0.005
 """Slope between neighbours below which no spline through them gets near twice MAX_SLOPE."""
 
+PER_STEP = 4
+"""Places from one node to the next at which `Compensator.between` looks."""
+
 _Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -308,6 +311,18 @@ class Compensator:
         if emap.artifact.harmonics:
             return 0.0
         return error_halfway(emap.g_theta, emap.u_g_theta, cubic=cubic, ring=True)[0]
+
+    def between(self) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return Gx and Gy, m, and Gtheta, rad, at nodes and at three points between neighbours.
+
+        Splines pass beyond the values of their nodes; bilinear ones do not.
+        """
+        artifact, count = self.error_map.artifact, PER_STEP * self.error_map.artifact.angular_count
+        places = [np.linspace(-half, half, round(2 * half * PER_STEP) + 1) * self._pitch
+                  for half in artifact.half]
+        grids = ([self.error_map.gx, self.error_map.gy] if self.method == "bilinear" else
+                 [*self.error(places[0][:, None], places[1])])
+        return grids, self._theta.at(np.arange(count) * (2 * np.pi / max(count, 1)))
 
     def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         hx, hy = self.error_map.artifact.half

@@ -27,6 +27,9 @@ KEEPS_UP = 20
 more wait, only the newest is corrected."""
 FARTHEST = 1e12
 """Largest valid position of a stage, m or rad."""
+LEAST_RADIUS_M = 0.02
+"""Distance from the axis at which an angular error counts at least: the map of a tiny plate may
+turn the stage by any angle otherwise."""
 
 
 class CompensatingSession:
@@ -117,25 +120,28 @@ class CompensatingSession:
 
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
-        self._refuse_large(error_map, source)
+        self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
         method, fitted = self._settings.interpolation, None
         if stated in get_args(Interpolation):
             fitted = cast(Interpolation, stated)
             method = fitted if error_map.valid.all() else "bilinear"
-        self.compensator = Compensator(error_map, method=method, fitted=fitted,
-                                       outside=self._settings.outside)
+        use = Compensator(error_map, method=method, fitted=fitted, outside=self._settings.outside)
+        self._refuse_large(error_map, *use.between(), source)
+        self.compensator = use
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
 
-    def _refuse_large(self, error_map: ErrorMap, source: str) -> None:
-        """Refuse a map that moves a position by more than `max_correction`.
+    def _refuse_large(self, error_map: ErrorMap, errors: Sequence[np.ndarray],
+                      errors_theta: np.ndarray, source: str) -> None:
+        """Refuse errors that move a position by more than `max_correction`.
 
-        The angular map moves the farthest site by its angle times the radius.
+        An angular error moves the farthest site, or what is as far as `LEAST_RADIUS_M`, by its
+        angle times the radius.
         """
         artifact, limit_m = error_map.artifact, self._settings.max_correction
-        radius_m = math.hypot(*artifact.half) * artifact.grid_pitch_m
-        largest_m = max(np.abs(part[~np.isnan(part)]).max(initial=0.0) for part in (
-            error_map.gx, error_map.gy, error_map.g_theta * radius_m))
+        radius_m = max(math.hypot(*artifact.half) * artifact.grid_pitch_m, LEAST_RADIUS_M)
+        largest_m = max(np.abs(part[~np.isnan(part)]).max(initial=0.0)
+                        for part in (*errors, errors_theta * radius_m))
         if largest_m > limit_m:
             raise InputError(f"the map of {source}", f"it corrects by up to {largest_m:.3g} m, "
                              f"max_correction is {limit_m:.3g} m",

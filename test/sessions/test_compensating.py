@@ -294,6 +294,34 @@ def test_max_correction_is_the_largest_error_that_is_used(factor):
     assert taken is (factor > 1) and (desk.session.compensator is not None) is taken
 
 
+@pytest.mark.parametrize(("interpolation", "used"), [("bilinear", True), ("bicubic", False)])
+@pytest.mark.parametrize("changed", ["gx", "g_theta"])
+def test_a_spline_that_passes_beyond_the_limit_between_its_nodes_is_not_used(
+        interpolation, used, changed):
+    """Through 0, 1, 1, 0 it reaches 9/8 in the middle, one of a circle about as much."""
+    error_map = random_map(Artifact(4, 0.01, 8), 3)
+    plateau = np.zeros_like(getattr(error_map, changed))
+    plateau[1:3] = {"gx": 0.95e-3, "g_theta": 0.95e-3 / np.hypot(0.015, 0.015)}[changed]
+    desk = Desk(require_qualified=False)
+    try:
+        desk.session.take_map(map_of(error_map, interpolation=interpolation,
+                                     **{changed: plateau.ravel()}))
+    except InputError as error:
+        assert "max_correction is 0.001 m" in str(error)
+    assert (desk.session.compensator is not None) is used
+
+
+@pytest.mark.parametrize(("angle", "used"), [(0.02, True), (0.06, False)])
+def test_the_map_of_a_tiny_plate_does_not_turn_a_stage_by_any_angle(angle, used):
+    desk, tiny = Desk(require_qualified=False), random_map(Artifact(5, 1e-6, 8), 3)
+    try:
+        desk.session.take_map(map_of(tiny, gx=np.zeros(25), gy=np.zeros(25),
+                                     g_theta=np.full(8, angle)))
+    except InputError as error:
+        assert "max_correction is 0.001 m" in str(error)
+    assert (desk.session.compensator is not None) is used
+
+
 def test_nan_where_the_map_is_not_valid_is_no_error(desk):
     """Unknown sites have no value; what stands there is not looked at."""
     known = [True] * 24 + [False]
