@@ -17,7 +17,7 @@ from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import IMAGES, ImageNoise, stops_of
 from selfcal_ros.estimation.joint.noise_effects import ADDED
 from selfcal_ros.estimation.joint.problem import bounded_ratio
-from selfcal_ros.estimation.joint.solved import KEY, MAX_SITES, factors_of, rounded
+from selfcal_ros.estimation.joint.solved import KEY, MAX_FULL, factors_of, rounded
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.law.solve import law_covariance
@@ -48,7 +48,7 @@ def xy_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
     u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
     if "xy" in (stored := result.extra.get(COVARIANCE, {})):
         return _stored(stored, "xy", np.tile(emap.valid, (2, 1)), np.tile(known, (2, 1)))
-    if known.size > MAX_SITES or not np.isfinite(u).all():
+    if known.size > MAX_FULL or not np.isfinite(u).all():
         return u**2
     if result.method == "law":
         law, both = law_covariance(result), np.tile(known.ravel(), 2)

@@ -11,7 +11,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, remove_modes, rms
 from selfcal_ros.model.result import CalibrationResult
 
-TINY = 1e-30
+NO_SPREAD = 1e-30
 FEWEST = 7
 """Values that are needed to be sure of a sign."""
 SURE = 5.0
@@ -51,7 +51,7 @@ def require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.nda
                                  f"{parts[first].name}: is it in {unit}?", "give m and rad")
         for signed, spread in ((maps, u), (lines, [np.sqrt(2) * emap.u_g_theta[1:]
                                                    for emap in emaps])):
-            if part.result is None and _is_opposite(*(signed[n] / np.maximum(spread[n], TINY)
+            if part.result is None and _is_opposite(*(signed[n] / np.maximum(spread[n], NO_SPREAD)
                                                  for n in (index, first))):
                 raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
                                  "negative agrees, and it does not",

@@ -25,7 +25,7 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.datum.angular import LinesCovariance
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.images import ImageNoise
-from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_SITES, OF_OFFSETS, factors_of
+from selfcal_ros.estimation.joint.solved import BESIDE, KEY, MAX_FULL, OF_OFFSETS, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.error_map import ErrorMap
@@ -195,7 +195,7 @@ def together(result: CalibrationResult) -> Together | None:
     """Return the joint covariance of stage and plate of a result; None if it is incomplete."""
     if result.method != "joint" or (
             result.model.terms and BESIDE not in result.extra.get(KEY, {})) \
-            or max(result.artifact.m.size, result.plate.m.size) > MAX_SITES:
+            or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
         return None
     system = system_behind(result)
     found = None if system is None else Together(result, system)

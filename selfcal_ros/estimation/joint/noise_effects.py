@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.visits import ViewVisits
 ADDED = "first_order_added"
 """Key of what such noise adds to the variances of O and R times the half width, unit noise."""
 
-MAX_SITES = 51 * 51
+MAX_STRUCTURED = 51 * 51
 """Largest field in which the axes are told apart: the time grows with the square of the sites."""
 
 CHUNK = 128

@@ -27,13 +27,13 @@ from selfcal_ros.estimation.joint.images import IMAGES, image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
-    MAX_SITES,
+    MAX_STRUCTURED,
     image_variances,
     structured,
 )
 from selfcal_ros.estimation.joint.problem import Problem, problem_of
-from selfcal_ros.estimation.joint.solved import MAX_SITES as MAX_FULL
 from selfcal_ros.estimation.joint.solved import (
+    MAX_FULL,
     MICROSCOPE_PARTS,
     OF_OFFSETS,
     Solved,
@@ -286,7 +286,7 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
         lines = LinesCovariance(cover, (found.xy.sigma, found.theta.sigma))
         if wanted:
             variance = cover.of_stage
-            if system.grid.n_sites <= MAX_SITES:
+            if system.grid.n_sites <= MAX_STRUCTURED:
                 more = structured(model, cover)
                 variance = variance + more
                 if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
@@ -350,7 +350,7 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     # the plate's covariance takes a factor of its own, as large as that of the stage
     if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
-        if system.grid.n_sites <= MAX_SITES and not isinstance(system, PlacedEquations):
+        if system.grid.n_sites <= MAX_STRUCTURED and not isinstance(system, PlacedEquations):
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:

@@ -146,7 +146,7 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
 KEY = "covariance_terms"
 """Key of the factors in a result."""
 
-MAX_SITES = 31 * 31
+MAX_FULL = 31 * 31
 """Largest field for a full covariance matrix."""
 
 BESIDE = "beside"
@@ -190,7 +190,7 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         What a unit of each coefficient makes of other quantities, stage frame; see `BESIDE`.
     """
     shape, beside = cover.system.grid.views.shape, beside or {}
-    if cover.system.grid.n_sites > MAX_SITES:
+    if cover.system.grid.n_sites > MAX_FULL:
         return {}
     maps = cover.maps_of_terms()[0]
     maps = maps.reshape(*shape, maps.shape[1])

@@ -13,7 +13,7 @@ GAP = 1e-9
 """Relative size below which an eigenvalue of a misalignment matrix is zero; true zeros are
 near 1e-15 and the smallest others above 1e-4."""
 
-CORE = 41
+CORE_SITES = 41
 """Sites per side of the middle part of a large field."""
 
 
@@ -49,7 +49,7 @@ class NormalEquations:
         If the middle of the plate determines all misalignments up to the datum, so does the
         whole, since more readings can only add; if not, the whole has to be factorised.
         """
-        if self.grid.n_sites <= CORE**2 or not self.rank_only:
+        if self.grid.n_sites <= CORE_SITES**2 or not self.rank_only:
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)
@@ -283,7 +283,7 @@ class NormalEquations:
 
 def core_of(grid: GridSystem) -> GridSystem:
     """Return the smaller system of the marks and sites in the middle of a field."""
-    low = [(size - CORE) // 2 if size > CORE else 0 for size in grid.views.shape]
+    low = [(size - CORE_SITES) // 2 if size > CORE_SITES else 0 for size in grid.views.shape]
     part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field

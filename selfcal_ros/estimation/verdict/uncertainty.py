@@ -16,7 +16,7 @@ from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solved import (
     ANGULAR_KEY,
     KEY,
-    MAX_SITES,
+    MAX_FULL,
     rounded,
     variance_of_terms,
 )
@@ -91,7 +91,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     emap, extra = result.error_map, dict(result.extra)
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
-    if emap.gx.size <= MAX_SITES and result.noise.sigma_xy > 0:
+    if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
         kept = extra.get(KEY, {"terms": [], "factors": []})
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
         extra[KEY] = {**kept, "terms": [*kept["terms"], *(effect.name for effect in effects)],

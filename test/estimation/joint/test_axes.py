@@ -74,7 +74,7 @@ def test_above_a_size_both_axes_have_one_uncertainty(monkeypatch):
     _, readings = measured(0.2)
     options = Options(assumed=(), causes=False)
     told = solve_joint(readings, options).result.error_map
-    monkeypatch.setattr(solve, "MAX_SITES", 24)
+    monkeypatch.setattr(solve, "MAX_STRUCTURED", 24)
     common = solve_joint(readings, options).result.error_map
     assert np.nanmean(told.u_gx) > np.nanmean(common.u_gx) > np.nanmean(told.u_gy)
-    assert noise_effects.MAX_SITES >= 21**2
+    assert noise_effects.MAX_STRUCTURED >= 21**2

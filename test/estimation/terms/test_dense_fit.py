@@ -65,7 +65,7 @@ PLANS = {
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests (test_axes.py, test_sizes.py)."""
-    monkeypatch.setattr(solve, "MAX_SITES", 0)
+    monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
     monkeypatch.setattr(sizes, "DOUBT_LEVEL", sizes.SIZE_LEVEL)
     monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
