@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.lattice.placed import MapSpline
+from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms

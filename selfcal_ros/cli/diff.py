@@ -11,13 +11,13 @@ from typing import Any
 
 from selfcal_ros.cli.terminal import busy, say, say_unless_qualified
 from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.comparison.maps import (
     LaserDifference,
     MapDifference,
     compare,
     compare_with_laser,
 )
-from selfcal_ros.estimation.comparison.together import plate_as_map
 from selfcal_ros.files import read_json
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult

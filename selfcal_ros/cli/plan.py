@@ -15,11 +15,15 @@ from selfcal_ros.cli.recheck import planned
 from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.estimation.normal.placed import KNOWN
-from selfcal_ros.estimation.observability.plan_budget import PlanBudget, plan_budget
-from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
-from selfcal_ros.estimation.observability.prediction import Prediction
-from selfcal_ros.estimation.observability.resistance import PlannedTerms, TermCheck, check_terms
+from selfcal_ros.estimation.normal.equations import KNOWN
+from selfcal_ros.estimation.observability.plan_check import Prediction, check_plan, predict_plan
+from selfcal_ros.estimation.observability.resistance import (
+    PlanBudget,
+    PlannedTerms,
+    TermCheck,
+    check_terms,
+    plan_budget,
+)
 from selfcal_ros.estimation.observability.suggest import (
     Against,
     Score,
@@ -28,7 +32,7 @@ from selfcal_ros.estimation.observability.suggest import (
     rank_next,
 )
 from selfcal_ros.estimation.terms.planned import Assumed
-from selfcal_ros.estimation.verdict.explanations import CAUSE_LEVEL
+from selfcal_ros.estimation.verdict.causes import CAUSE_LEVEL
 from selfcal_ros.files import write_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict

@@ -15,7 +15,6 @@ from typing import Any
 from selfcal_ros.cli.plan_terms import length_m
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.estimation.observability.plan_budget import PlanBudget, plan_budget
 from selfcal_ros.estimation.observability.plan_check import (
     CHECK_MARKS,
     CHECK_OFFSET_M,
@@ -23,6 +22,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     describe_view,
     predict_plan,
 )
+from selfcal_ros.estimation.observability.resistance import PlanBudget, plan_budget
 from selfcal_ros.estimation.observability.suggest import (
     Against,
     best_plan,

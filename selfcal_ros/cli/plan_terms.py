@@ -11,8 +11,7 @@ from typing import Any
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.observability.plan_budget import PlanBudget
-from selfcal_ros.estimation.observability.resistance import TermCheck
+from selfcal_ros.estimation.observability.resistance import PlanBudget, TermCheck
 from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, Assumed
 from selfcal_ros.model.terms import (
     DRIFT_DEGREE,

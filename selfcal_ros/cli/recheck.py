@@ -8,8 +8,8 @@ from pathlib import Path
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, tell
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.estimation.recheck.planned import predict_recheck
 from selfcal_ros.estimation.recheck.plate import known_plate
+from selfcal_ros.estimation.recheck.solve import predict_recheck
 from selfcal_ros.model.view import Plan
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.summary.numbers import counted

@@ -9,16 +9,17 @@ import numpy as np
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
-from selfcal_ros.estimation.checks.turned import (
+from selfcal_ros.estimation.checks.wiring import (
     AS_IS,
     OTHER_LINES,
     PAIRS,
     Turned,
+    check_wiring,
     shows_offsets,
+    sign_is_shown,
     turned_error,
     turned_readings,
 )
-from selfcal_ros.estimation.checks.wiring import check_wiring, sign_is_shown
 from selfcal_ros.estimation.comparison.verification import corrected, require_correctable
 from selfcal_ros.estimation.joint.camera import (
     Camera,
@@ -29,8 +30,7 @@ from selfcal_ros.estimation.joint.camera import (
     yaw_of,
 )
 from selfcal_ros.estimation.joint.images import IMAGES
-from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
-from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options

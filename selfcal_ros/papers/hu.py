@@ -9,11 +9,10 @@ from functools import partial
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.law.equations import HuReadings
-from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
+from selfcal_ros.estimation.law.solve import HuReadings, hu_readings, hu_views, law_for
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.normal.equations import planned_system
+from selfcal_ros.estimation.observability.plan_check import predict
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum

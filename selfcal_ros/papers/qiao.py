@@ -9,8 +9,8 @@ import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.normal.equations import planned_system
+from selfcal_ros.estimation.observability.plan_check import predict
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

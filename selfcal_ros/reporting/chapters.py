@@ -10,7 +10,7 @@ import numpy as np
 
 from selfcal_ros import __version__
 from selfcal_ros.errors import printable
-from selfcal_ros.estimation.comparison.together import plate_as_map
+from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import lsmr, splu
 from timing import median_time
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.systems import clear_cache
+from selfcal_ros.estimation.normal.equations import clear_cache
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Measurements

@@ -87,7 +87,7 @@ def ours(benchmark: str, data) -> tuple:
     import numpy as np
 
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.estimation.normal.systems import clear_cache
+    from selfcal_ros.estimation.normal.equations import clear_cache
     from selfcal_ros.estimation.options import Options
 
     quick = Options(misalignment_model="linear", uncertainty=False)

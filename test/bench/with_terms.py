@@ -10,7 +10,7 @@ import numpy as np
 from timing import median_time
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.systems import clear_cache
+from selfcal_ros.estimation.normal.equations import clear_cache
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.between import Run, mean_of
+from selfcal_ros.estimation.comparison.combine import Run, mean_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets

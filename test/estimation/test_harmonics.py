@@ -20,7 +20,7 @@ from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.rank import best_turn_deg
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.prediction import line_errors
+from selfcal_ros.estimation.quality.validation import line_errors
 from selfcal_ros.estimation.recheck.views import line_rows
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.joint.solve import fit_joint
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
-from selfcal_ros.estimation.observability.unseen import equivalent_key
+from selfcal_ros.estimation.observability.rank import equivalent_key
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.roughness import adequacy_of
 from selfcal_ros.model.artifact import Artifact, Interpolation

@@ -4,7 +4,7 @@
 import gc
 import weakref
 
-from selfcal_ros.estimation.normal.systems import Memo, planned_system
+from selfcal_ros.estimation.normal.equations import Memo, planned_system
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of
 

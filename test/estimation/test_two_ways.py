@@ -9,9 +9,8 @@ import pytest
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.estimation.quality import prediction
-from selfcal_ros.estimation.quality.outliers import clean
-from selfcal_ros.estimation.quality.residuals import noisy_views, residuals_of
+from selfcal_ros.estimation.quality import validation
+from selfcal_ros.estimation.quality.outliers import clean, noisy_views, residuals_of
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings, subset
@@ -98,7 +97,7 @@ def test_robust_knows_finite_rotations_of_a_rough_plate():
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits of predictions roughly: what is compared here is the prediction."""
-    monkeypatch.setattr(prediction, "DRAWS", 16)
+    monkeypatch.setattr(validation, "DRAWS", 16)
 
 
 @pytest.mark.parametrize("sense", Sense)

@@ -158,8 +158,8 @@ def test_qiaos_noise_run_meets_the_bound_not_the_printed_figure(qiao):
 
 
 def test_the_unseen_part_of_program_2_is_all_that_is_wrong(qiao):
-    from selfcal_ros.estimation.normal.systems import planned_system
-    from selfcal_ros.estimation.observability.unseen import is_unseen
+    from selfcal_ros.estimation.normal.equations import planned_system
+    from selfcal_ros.estimation.observability.rank import is_unseen
     from selfcal_ros.papers.qiao import ARTIFACT, PROGRAMS, plan_of
 
     system = planned_system(ARTIFACT, plan_of(PROGRAMS[1]).views)

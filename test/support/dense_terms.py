@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import f as central_f
 from scipy.stats import ncf
 
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.terms.planned import planned_ground
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm

@@ -11,13 +11,11 @@ from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
-    theta_covariance,
-    xy_covariance,
-)
-from selfcal_ros.estimation.comparison.together import (
     plate_as_map,
     plate_covariance,
     plate_theta_covariance,
+    theta_covariance,
+    xy_covariance,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.artifact import Artifact

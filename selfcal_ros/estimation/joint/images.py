@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.normal.systems import Memo
+from selfcal_ros.estimation.normal.equations import Memo, NormalEquations
 from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact

@@ -6,11 +6,25 @@ only, and the diagonal of the inverse follows from the last front down to the fi
 with K = J' J and W = J' Y', Z12 = -W Z22, Z11 = K - Z12 W', with Z22 taken from the parent's Z.
 All this is real except for the cut, which is solved last; only the real part of its inverse
 enters the diagonal.
+
+The elimination order: the field folded into a quadrant, and its nested dissection.
+
+With G(X) = i^k h(X), k the quadrant of X, and the like for marks, a reading whose mark and site
+lie k quarter turns apart, as the view turns them, joins h and A by the real number 1. Only a
+shift across an axis leaves a factor i^g. The few sites that such readings touch are the cut:
+each gets one real copy for every g, and copies are joined by i^g h(X) at the very end. All the
+rest of the elimination is real (method eq. 8.1).
+
+A mark joins only sites that quarter turns and small shifts carry into each other. Folded into
+one eighth of the plane, (max(|i|, |j|), min(|i|, |j|)), such sites are neighbours, so straight
+cuts through the folded field separate the matrix.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
+from itertools import combinations, pairwise
 from threading import RLock
 from typing import Any
 
@@ -20,7 +34,289 @@ import scipy.linalg  # noqa: F401  (so must scipy's own)
 from scipy.linalg import blas, lapack
 from threadpoolctl import ThreadpoolController
 
-from selfcal_ros.estimation.multifrontal.dissection import RealSymmetricForm, dissect
+from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
+
+
+@dataclass(frozen=True, eq=False)
+class RealSymmetricForm:
+    """The matrix M = P^H R P over the sites, with R real.
+
+    Attributes
+    ----------
+    rows, columns : int array (entries,)
+        Variables joined by an entry of R: the free sites, then the copies of the cut sites. R is
+        symmetric, an entry may be in either triangle; duplicate entries are summed.
+    values : float array (entries,)
+        The entries.
+    size : int
+        Number of variables.
+    free, cut : int array
+        Sites without and with copies.
+    copy_of : int array (copies,)
+        Index of each copy's site in `cut`.
+    copy_phase : complex array (copies,)
+        i^g: copy = i^g h.
+    phase : complex array (sites,)
+        i^k: G = i^k h.
+    pins : float array (cut,)
+        Values added to the diagonal of the cut sites.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+    size: int
+    free: np.ndarray
+    cut: np.ndarray
+    copy_of: np.ndarray
+    copy_phase: np.ndarray
+    phase: np.ndarray
+    pins: np.ndarray
+
+
+def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
+         pins: np.ndarray) -> RealSymmetricForm:
+    """Return the folded matrix of weighted readings.
+
+    Parameters
+    ----------
+    views : LatticeViews
+        Maps between sites and marks.
+    weight, relative_weight : float array (views, nx, ny)
+        Weight of each reading, and its share in the mean of its mark.
+    pins : int array
+        Sites whose diagonal is raised by the mean weight, because they are otherwise undetermined.
+    """
+    n_sites, read = weight[0].size, (weight > 0).reshape(len(weight), -1)
+    quadrant = _quadrants(views.shape)
+    index = views.site_index.reshape(len(weight), -1)
+    turns = np.array([pose.q for pose in views.poses])[:, None]
+    gain = (quadrant[index] - quadrant - turns) % 4
+    is_cut = np.zeros(n_sites, dtype=bool)
+    is_cut[index[read & (gain != 0)]] = True
+    free, cut = np.flatnonzero(~is_cut), np.flatnonzero(is_cut)
+    cut = cut[np.argsort(np.abs(views.z.ravel()[cut]), kind="stable")]
+    place = np.empty(n_sites, dtype=np.int64)
+    place[free], place[cut] = np.arange(len(free)), np.arange(len(cut))
+
+    on_cut = read & is_cut[index]
+    keys, copies = np.unique(place[index[on_cut]] * 4 + gain[on_cut], return_inverse=True)
+    variable = place[index]
+    variable[on_cut] = len(free) + copies
+    mean = weight.sum() / max(np.count_nonzero(read), 1)
+    size = len(free) + len(keys)
+    diagonal = np.bincount(variable.ravel(), (weight * (1 - relative_weight)).ravel(),
+                           minlength=size)
+    diagonal[place[pins[~is_cut[pins]]]] += mean
+    entries = _entries(variable, diagonal, weight.reshape(read.shape),
+                       relative_weight.reshape(read.shape))
+    cut_pins = np.zeros(len(cut))
+    cut_pins[place[pins[is_cut[pins]]]] = mean
+    return RealSymmetricForm(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
+                             PHASES[quadrant], cut_pins)
+
+
+def _quadrants(shape: tuple[int, int]) -> np.ndarray:
+    """Return k of every site, X = R^k o with o in the quadrant x > 0, y >= 0; the centre has 0."""
+    x, y = (np.arange(size) - (size - 1) / 2 for size in shape)
+    x, y = np.repeat(x, shape[1]), np.tile(y, shape[0])
+    out = np.where((x <= 0) & (y > 0), 1, 0)
+    out[(x < 0) & (y <= 0)] = 2
+    out[(x >= 0) & (y < 0)] = 3
+    return out
+
+
+def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray,
+             relative_weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows, columns and values of one triangle of R."""
+    rows, values = [np.arange(len(diagonal))], [diagonal]
+    columns = rows.copy()
+    for i, j in combinations(range(len(weight)), 2):
+        both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
+        a, b = variable[i][both], variable[j][both]
+        value = -weight[i][both] * relative_weight[j][both]
+        rows.append(a)
+        columns.append(b)
+        # an entry and its mirror image may coincide on the diagonal
+        values.append(np.where(a == b, 2 * value, value))
+    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+
+LEAF = 192
+"""Number of sites below which a part of the field is not cut further."""
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """One dense block of the elimination.
+
+    Attributes
+    ----------
+    start, stop : int
+        Range of the variables eliminated here, in the order of elimination.
+    boundary : int array (b,)
+        Later variables joined to these, sorted.
+    children : tuple of int
+        Fronts eliminated into this one.
+    offset : int
+        Start of the front's values in the common storage: the block of its own variables,
+        then the block of its boundary against them, both by columns.
+    """
+
+    start: int
+    stop: int
+    boundary: np.ndarray
+    children: tuple[int, ...]
+    offset: int
+
+    @property
+    def size(self) -> int:
+        """Number of values stored by the front."""
+        own = self.stop - self.start
+        return own * (own + len(self.boundary))
+
+    def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return views of the blocks (own, own) and (b, own), by columns."""
+        own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
+        return (storage[self.offset:middle].reshape(own, own).T,
+                storage[middle:self.offset + self.size].reshape(own, -1).T)
+
+    def places(self, variables: np.ndarray) -> np.ndarray:
+        """Return the positions of variables in this front: its own first, then its boundary."""
+        own = self.stop - self.start
+        return np.where(variables < self.stop, variables - self.start,
+                        own + np.searchsorted(self.boundary, variables))
+
+
+@dataclass(frozen=True, eq=False)
+class Dissection:
+    """Elimination order and fronts, children before parents.
+
+    Attributes
+    ----------
+    order : int array (free,)
+        Variable eliminated at each position; the copies of the cut follow in their order.
+    fronts : tuple of Front
+        In elimination order.
+    top : tuple of int
+        Fronts without a parent: only copies are left on their boundaries.
+    storage : float array
+        The lower triangle of the matrix, laid out for the fronts.
+    rest : float array (copies, copies)
+        The lower triangle over the copies, by columns.
+    """
+
+    order: np.ndarray
+    fronts: tuple[Front, ...]
+    top: tuple[int, ...]
+    storage: np.ndarray
+    rest: np.ndarray
+
+
+def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Dissection:
+    """Return the nested dissection of a matrix over sites of a field.
+
+    Parameters
+    ----------
+    folded : RealSymmetricForm
+        The matrix; copies are not eliminated here.
+    shape : tuple of int
+        Sites along x and y.
+    reach : int
+        Largest folded distance of two sites joined by the matrix.
+    """
+    # |x| and |y|, rounded down to whole pitches
+    i, j = (abs(2 * at - size + 1) // 2 for at, size in zip(
+        np.divmod(folded.free, shape[1]), shape, strict=True))
+    far, near = np.maximum(i, j), np.minimum(i, j)
+    pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
+    # consecutive: the variables of a front are contiguous in memory
+    rows = np.argsort(far * (max(shape) + 1) + near, kind="stable")
+    top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
+    order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
+
+    n, size = len(order), folded.size
+    position = np.arange(size)
+    position[order] = np.arange(n)
+    a, b = position[folded.rows], position[folded.columns]
+    row, column = np.maximum(a, b), np.minimum(a, b)
+    inner = column < n
+    lengths = [len(piece) for piece, _ in pieces]
+    front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
+    fronts = _fronts(pieces, row[inner], front, size=size)
+    total = sum(one.size for one in fronts)
+    at = total + (column - n) * (size - n) + row - n
+    at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
+    both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
+    return Dissection(order, fronts, top, both[:total],
+                      both[total:].reshape(size - n, size - n).T)
+
+
+def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
+    """Return the fronts of the pieces, given the matrix rows in each front's columns."""
+    stops = np.cumsum([len(piece) for piece, _ in pieces], dtype=int)
+    later = row >= stops[front]
+    keys = np.unique(front[later] * size + row[later])
+    cuts = np.searchsorted(keys, np.arange(len(pieces) + 1) * size).tolist()
+    keys %= size
+    fronts: list[Front] = []
+    start = offset = 0
+    for (_, children), (a, b), stop in zip(pieces, pairwise(cuts), stops.tolist(), strict=True):
+        boundary = keys[a:b]
+        if children:
+            later = np.concatenate([boundary, *(fronts[c].boundary for c in children)])
+            boundary = np.unique(later[later >= stop])
+        fronts.append(Front(start, stop, boundary, children, offset))
+        start, offset = stop, offset + fronts[-1].size
+    return tuple(fronts)
+
+
+def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *,
+               front: np.ndarray, size: int) -> np.ndarray:
+    """Return the storage positions of entries (row, column) of the lower triangle."""
+    start = np.array([one.start for one in fronts])[front]
+    own = np.array([one.stop for one in fronts])[front] - start
+    widths = np.array([len(one.boundary) for one in fronts])
+    keys = np.concatenate([np.zeros(0, dtype=int), *(
+        number * size + one.boundary for number, one in enumerate(fronts))])
+    before = np.cumsum(widths) - widths
+    place = np.searchsorted(keys, front * size + row) - before[front]
+    offset = np.array([one.offset for one in fronts])[front]
+    column = column - start
+    return offset + np.where(row < start + own, column * own + row - start,
+                             own * own + column * widths[front] + place)
+
+
+def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
+    """Append the pieces of `sites`, separators last; return the indices of the topmost ones."""
+    if not len(sites):
+        return ()
+    if len(sites) > LEAF:
+        at = folded[:, sites]
+        spans = at.max(axis=1) - at.min(axis=1)
+        axis = int(np.argmax(spans))
+        if spans[axis] > 2 * reach:
+            low = _best_cut(at[axis], reach)
+            left, right = at[axis] < low, at[axis] >= low + reach
+            below = (*_cut(sites[left], folded, reach, pieces),
+                     *_cut(sites[right], folded, reach, pieces))
+            between = sites[~left & ~right]
+            if not len(between):
+                return below
+            pieces.append((between, below))
+            return (len(pieces) - 1,)
+    pieces.append((sites, ()))
+    return (len(pieces) - 1,)
+
+
+def _best_cut(at: np.ndarray, reach: int) -> int:
+    """Return where to cut into two non-empty halves, as equal as possible."""
+    counts = np.bincount(at - at.min())
+    before = np.concatenate([[0], np.cumsum(counts)])
+    starts = np.arange(1, len(counts) - reach)
+    left, right = before[starts], before[-1] - before[starts + reach]
+    return int(starts[np.argmin(np.maximum(left, right))] + at.min())
+
 
 SMALL = 64
 """Largest side of a triangle inverted by substitution."""

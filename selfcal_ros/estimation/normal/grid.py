@@ -20,8 +20,7 @@ from selfcal_ros.estimation.lattice.connectivity import (
     rest_on_one,
 )
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews, rigid_parameters
-from selfcal_ros.estimation.multifrontal.dissection import fold
-from selfcal_ros.estimation.multifrontal.factor import Factor
+from selfcal_ros.estimation.multifrontal.factor import Factor, fold
 from selfcal_ros.model.pose import LatticePose
 
 

@@ -8,25 +8,527 @@ end each removed reading is restored if it agrees with the others after all (F-t
 contribution to the sum of squares, at a level that n good readings, marks and lines together, fail
 with probability OUTLIER_LEVEL). Before that a view in which the plate slipped is split, unless a
 term of the model explains the readings better.
+
+Residuals with their leverage, the share of a reading that the fit follows; noisy views.
+
+The leverage h of a reading is the share of it that the fit follows; its residual has the standard
+deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
+h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error. Its two
+coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rotations make.
+
+Grid and angular readings are fitted separately here, so that the sums of squares of each kind have
+exactly known distributions. Views noisier than the others are found by their own repeats and by
+their residuals.
+
+Slips of the plate within a view: find and size them, split the view into two placements.
+
+A view is read line by line. If the plate slips on the way, the rest of the view has another
+misalignment. For each view and each line the gain of a second misalignment is tested: the sum of
+squares that it explains, from the projection of its three columns on the residuals.
+
+A turned microscope, a drift or a plate that grew leaves residuals that a second misalignment
+removes in part. Before a view is split, its slip therefore competes with every term that the model
+does not hold.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, gammaincinv
+from scipy.optimize import nnls
+from scipy.special import chdtri, fdtrc, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.joint.problem import FLOOR
-from selfcal_ros.estimation.joint.solve import fit_joint
+from selfcal_ros.estimation.joint.problem import FLOOR, JointFit, Problem, fit
+from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.equations import (
+    Memo,
+    NormalEquations,
+    angular_residuals,
+    grid_residuals,
+)
+from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.residuals import Residuals, noisy_views, residuals_of
-from selfcal_ros.estimation.quality.slip import Slip, find_slip, likelier_term, split_view
+from selfcal_ros.estimation.quality.validation import noise_of
+from selfcal_ros.estimation.verdict.causes import (
+    SLIP,
+    PlacedSlip,
+    cause_of,
+    find_explanations,
+    noisier_views,
+)
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Key, Measurements, left_out, without
+from selfcal_ros.model.readings import Key, Measurements, ViewReadings, left_out, without
 from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.verdict import Cause, Finding
+
+EXACT_SITES = 31 * 31
+"""Largest field whose leverages are computed exactly; in larger ones from seeded draws."""
+
+EXACT_LINES = 2048
+"""Largest number of lines whose leverages are computed exactly; otherwise all have their mean."""
+
+N_DRAWS = 64
+"""Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
+
+VIEW_DRAWS = 16
+"""Draws of unit noise in each view, to separate the noises of the views."""
+
+CHECKED = 0.05
+"""Smallest 1 - h of a reading that the others can check."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of all readings.
+
+    Attributes
+    ----------
+    problem : Problem
+        The plan and its readings.
+    found : JointFit
+        Joint fit of the readings.
+    redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
+        1 - h; 0 where not read.
+    skew : complex array (views, nx, ny)
+        Difference of h between the coordinates, see above.
+    """
+
+    problem: Problem
+    found: JointFit
+    redundancy: np.ndarray
+    redundancy_theta: np.ndarray
+    skew: np.ndarray
+
+    @property
+    def squares(self) -> np.ndarray:
+        """Residual' (1 - h)^-1 residual weight, m^2, (views, nx, ny): 2 sigma^2 on average.
+
+        Reduction of the sum of squares without the reading; NaN where it cannot be checked.
+        """
+        residual, skew = self.found.residuals, abs(self.skew)
+        good = self.redundancy - skew > CHECKED
+        both = np.where(good, self.redundancy**2 - skew**2, 1.0)
+        form = (self.redundancy * abs(residual) ** 2
+                + np.real(np.conj(self.skew) * residual**2))
+        return np.where(good, form / both * self.problem.grid.weight, np.nan)
+
+    @property
+    def squares_theta(self) -> np.ndarray:
+        """The same for angular readings, rad^2, (views, K); sigma^2 on average."""
+        return _scaled(self.found.residuals_theta**2, self.problem.angular.weight,
+                       self.redundancy_theta)
+
+    def p_outlier(self, kind: str, at: tuple[int, ...]) -> float:
+        """Return the probability that a good reading fits the others as badly; NaN if unknown.
+
+        F-test of the reading's contribution to the sum of squares against the remainder.
+        """
+        if kind == "grid":
+            system, squares, weight, residual, columns = (
+                self.problem.system, self.squares, self.problem.grid.weight,
+                abs(self.found.residuals), 2)
+            dof = 2 * system.grid.n_readings - system.rank_grid
+        else:
+            system, squares, weight, residual, columns = (
+                self.problem.system, self.squares_theta, self.problem.angular.weight,
+                self.found.residuals_theta, 1)
+            dof = system.angular.n_readings - system.rank_angular
+        rest = float((weight * residual**2).sum()) - float(squares[at])
+        if not np.isfinite(rest) or dof <= columns:
+            return float("nan")
+        noise = max(rest / (dof - columns), FLOOR**2)
+        return float(fdtrc(columns, dof - columns, squares[at] / columns / noise))
+
+
+def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> np.ndarray:
+    good = redundancy > CHECKED
+    return np.where(good, squares * weight / np.where(good, redundancy, 1.0), np.nan)
+
+
+def residuals_of(measurements: Measurements, options: Options) -> Residuals:
+    """Fit the readings jointly and return their residuals with redundancies."""
+    problem, _ = prepare(measurements, options)
+    system = problem.system
+    found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
+                    residuals_theta=angular_residuals(system, problem.angular.y))
+    if system.grid.n_sites <= EXACT_SITES and measurements.artifact.map_grid is None:
+        redundancy, skew = exact_leverage(system)
+    else:
+        redundancy = drawn_redundancy(system)
+        skew = np.zeros(redundancy.shape, dtype=complex)
+    return Residuals(problem, found, redundancy, angular_redundancy(system), skew)
+
+
+def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Return 1 - h and the skew of every grid reading, (views, nx, ny)."""
+    grid = system.grid
+    inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
+    index = np.maximum(grid.views.site_index, 0)
+    basis = np.array([grid.centred(grid.views.gather(-column.reshape(grid.views.shape))
+                                   + grid.misaligned(unit)) for column, unit in
+                      zip(grid.response.T, np.eye(3 * grid.n_views), strict=True)])
+    answer = np.einsum("pq,qvij->pvij", system.grid_inverse, basis)
+    skew = np.einsum("pvij,pvij->vij", basis, answer) / 2
+    return _redundancy(grid, grid.views.phases.conj(), lambda i, j: inverse[index[i], index[j]],
+                       np.einsum("pvij,pvij->vij", np.conj(basis), answer).real / 2), (
+        grid.weight * skew)
+
+
+def _redundancy(part: GridSystem | AngularSystem, turns: np.ndarray,
+                entry: Callable[[int, int], np.ndarray], spread: np.ndarray) -> np.ndarray:
+    """Return 1 - h of every reading of one kind.
+
+    Parameters
+    ----------
+    part : GridSystem or AngularSystem
+        The readings.
+    turns : array (views,)
+        Factors from the map to the readings of each view.
+    entry : callable
+        Covariances of the map at the places of each mark in one and another view.
+    spread : float array (views, ...)
+        Variance of the readings that the misalignments of the views make.
+    """
+    weight, total = part.weight, part.weight.sum(axis=0)
+    variance = np.zeros(weight.shape)
+    for v in range(part.n_views):
+        own = -part.relative_weight * turns.reshape(-1, *[1] * total.ndim)
+        own[v] += turns[v]
+        for i in range(part.n_views):
+            for j in range(part.n_views):
+                variance[v] += np.real(own[i] * entry(i, j) * np.conj(own[j]))
+    h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))
+    return np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0)
+
+
+def drawn_redundancy(system: NormalEquations) -> np.ndarray:
+    """Return 1 - h of every grid reading from the residuals of seeded unit noise."""
+    grid = system.grid
+    rng = np.random.default_rng(0)
+    total = np.zeros(grid.weight.shape)
+    for _ in range(N_DRAWS):
+        residuals = grid_residuals(system, noise_of(rng, total.shape, grid.weight))
+        total += abs(residuals) ** 2 * grid.weight
+    return np.where(grid.read, np.minimum(total / (2 * N_DRAWS), 1.0), 0.0)
+
+
+def view_noise(residuals: Residuals) -> np.ndarray:
+    """Return the noise of each grid view and of the others, m, and its degrees of freedom.
+
+    The residuals of one view contain the noise of all. Their sums of squares are separated with
+    those that seeded unit noise of each view leaves in each (Helmert's variance components, two at
+    a time). Twice the inverse of that mixing is the covariance of two variances that are 1.
+
+    Returns
+    -------
+    float array (views, 3)
+    """
+    system, grid = residuals.problem.system, residuals.problem.system.grid
+    mixing = _mixings.get(system, None, lambda: _mixing(system))
+    sums = (abs(residuals.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
+    out = np.empty((grid.n_views, 3))
+    for v in range(grid.n_views):
+        group = np.zeros((grid.n_views, 2))
+        group[:, 1], group[v] = 1.0, (1.0, 0.0)
+        normal = group.T @ mixing @ group
+        out[v, :2] = np.sqrt(nnls(normal, group.T @ sums)[0])
+        out[v, 2] = normal[0, 0] - normal[0, 1] ** 2 / max(normal[1, 1], 1e-300)
+    return out
+
+
+_mixings: Memo[None, np.ndarray] = Memo()
+
+
+def _mixing(system: NormalEquations) -> np.ndarray:
+    """Return the sum of squares that unit noise of each view leaves in each, (views, views)."""
+    grid, rng = system.grid, np.random.default_rng(0)
+    mixing = np.zeros((grid.n_views, grid.n_views))
+    for u in range(grid.n_views):
+        for _ in range(VIEW_DRAWS):
+            noise = np.zeros(grid.weight.shape, dtype=complex)
+            noise[u] = noise_of(rng, noise[u].shape, grid.weight[u])
+            rest = grid_residuals(system, noise)
+            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
+    return (mixing + mixing.T) / 2
+
+
+def angular_redundancy(system: NormalEquations) -> np.ndarray:
+    """Return 1 - h of every angular reading, (views, K), with rotations from the lines alone."""
+    angular = system.angular
+    if not angular.n_views:
+        return np.zeros(angular.weight.shape)
+    if angular.n_lines > EXACT_LINES:
+        mean = 1 - system.rank_angular / max(angular.n_readings, 1)
+        return np.where(angular.read, mean, 0.0)
+    inverse = angular.solve(np.eye(angular.n_lines))
+    basis = np.array([angular.centred(unit[:, None] - angular.gather(column)) for column, unit in
+                      zip(angular.response.T, np.eye(angular.n_views), strict=True)])
+    return _redundancy(angular, np.ones(angular.n_views),
+                       lambda i, j: angular.covariance(inverse, i, j),
+                       np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis))
+
+
+NOISY_RESIDUALS = 3.0
+"""Ratio of a view's noise to that of the others, by residuals, above which it is noisy."""
+
+MIN_VIEW_DOF = 5.0
+"""Smallest degrees of freedom of a view's own noise for the test by residuals."""
+
+MAX_RATIO = 20.0
+"""Largest ratio of noises that residuals can show: a noisy view hides the noise of the others."""
+
+
+def noisy_views(residuals: Residuals, measurements: Measurements
+                ) -> tuple[tuple[str, float], ...]:
+    """Return the noisy views, each with the ratio of its noise to that of the others."""
+    found = by_repeats(measurements)
+    for name, ratio in _by_residuals(residuals, measurements).items():
+        found[name] = max(ratio, found.get(name, 0.0))
+    return tuple((view.view.name, found[view.view.name]) for view in measurements.views
+                 if view.view.name in found)
+
+
+def by_repeats(measurements: Measurements) -> dict[str, float]:
+    """Return the views whose repeats scatter more than those of the others (F-test)."""
+    return {cause.view: cause.size for cause in noisier_views([
+        (v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
+        if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)])}
+
+
+def _by_residuals(residuals: Residuals, measurements: Measurements) -> dict[str, float]:
+    if residuals.problem.system.grid.n_views < 2:
+        return {}
+    out = {}
+    for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
+                                         strict=True):
+        ratio = float(own / max(others, own / MAX_RATIO, FLOOR))
+        if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
+            out[measurements.views[index].view.name] = ratio
+    return out
+
+
+AMBIGUOUS = 16.0
+"""Difference of chi^2 up to which two places explain the readings equally well."""
+
+TRIED = 12
+"""Number of places at which the view is split on trial."""
+
+TINY_M2 = 1e-30
+"""Square of a noise that is rounding error."""
+
+SLIP_LEVEL = 1e-9
+"""Level of the test of each place where the plate may have slipped."""
+
+MAX_PLACES = 20
+"""Largest number of places tested along each axis of a view."""
+
+CLIP = 4.0
+"""Standard deviations to which residuals are clipped: one outlier is not a slip."""
+
+
+@dataclass(frozen=True)
+class SlipPlace:
+    """Where in a view the plate may have slipped.
+
+    Attributes
+    ----------
+    view : str
+        Name of the view.
+    index : int
+        Its position in the measurement.
+    axis : str
+        ``m`` or ``n``: index of the marks along which the view was read.
+    first : int
+        First value of that index after the slip.
+    chi2 : float
+        Explained sum of squares over the noise variance; 3 on average without a slip.
+    """
+
+    view: str
+    index: int
+    axis: str
+    first: int
+    chi2: float
+
+    @property
+    def place(self) -> dict[str, str | int]:
+        """View, axis and first line of marks after the slip."""
+        return {"view": self.view, "axis": self.axis, "first": self.first}
+
+
+@dataclass(frozen=True)
+class Slip(SlipPlace):
+    """A slip of the plate within a view, at a place.
+
+    Attributes
+    ----------
+    tx_m, ty_m, phi_rad : float
+        Change of offset and rotation, stage frame.
+    alternatives : tuple of SlipPlace
+        Other places that explain the readings equally well: few views do not always determine it.
+    """
+
+    tx_m: float
+    ty_m: float
+    phi_rad: float
+    alternatives: tuple[SlipPlace, ...] = ()
+
+    def finding(self, *, spoils: bool) -> Finding:
+        """Return the slip as a finding; `spoils` if the view had to be kept unsplit."""
+        return Finding(
+            "slip_found", float(np.hypot(self.tx_m, self.ty_m)), unit="m", view=self.view, details={
+                "places": [place.place for place in (self, *self.alternatives)], "x": self.tx_m,
+                "y": self.ty_m, "phi": self.phi_rad, "spoils": spoils})
+
+
+def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
+              options: Options) -> Slip | None:
+    """Return the slip that explains the residuals best; None if no place passes the test.
+
+    The view is split on trial at the places that explain most; the best split is the slip.
+
+    Parameters
+    ----------
+    residuals : Residuals
+        Residuals of the fit.
+    sigma_m : float
+        Noise of one reading, m.
+    measurements, options : Measurements, Options
+        The readings and how they were fitted.
+    """
+    grid = residuals.problem.system.grid
+    found: list[SlipPlace] = []
+    limit = CLIP * sigma_m / np.sqrt(np.where(grid.read, grid.weight, 1.0))
+    size = abs(residuals.found.residuals)
+    clipped = residuals.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
+    for v, i in enumerate(residuals.problem.grid.index):
+        for axis in (0, 1) if measurements.artifact.marks is None else ():
+            for place in _places(grid.read[v], axis):
+                gain = _explained(residuals, clipped, v, axis, place)
+                if gain is not None and gain / sigma_m**2 >= chdtri(3, SLIP_LEVEL):
+                    found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
+                                           grid.views.mark_at(place, place)[axis],
+                                           gain / sigma_m**2))
+    found.sort(key=lambda slip: -slip.chi2)
+    return _best(found[:TRIED], measurements, options)
+
+
+def _best(found: list[SlipPlace], measurements: Measurements, options: Options) -> Slip | None:
+    """Return the slip whose split leaves the smallest clipped sum of squares."""
+    fits = []
+    for slip in found:
+        try:
+            problem, _ = prepare(split_view(measurements, slip), options)
+        except NotIdentifiableError:
+            continue
+        fitted = fit(problem, problem.grid.y)
+        weight = problem.grid.weight
+        squares = (abs(fitted.residuals) ** 2 * weight)[weight > 0]
+        fits.append((slip, squares, _size(slip, fitted, problem)))
+    if not fits:
+        return None
+    limit = CLIP**2 * max(min(float(np.median(squares)) for _, squares, _ in fits), TINY_M2)
+    losses = [float(np.minimum(squares, limit).sum()) for _, squares, _ in fits]
+    order = np.argsort(losses, kind="stable")
+    slip, squares, size = fits[order[0]]
+    # the loss counts residuals, which are smaller than the noise by the part that the fit follows
+    system = prepare(split_view(measurements, slip), options)[0].system
+    dof_part = 1 - system.rank_grid / (2 * system.grid.n_readings)
+    near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
+    others = tuple(fits[i][0] for i in order[1:] if losses[i] < near)
+    tx_m, ty_m, phi_rad = size
+    return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
+                others)
+
+
+def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
+    """Return offset and rotation of the second placement minus those of the first."""
+    row = problem.grid.index.index(slip.index)
+    before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
+    phi, re, im = after - before
+    t = problem.grid.poses[row].phase * complex(re, im)
+    return float(t.real), float(t.imag), float(phi / problem.half_width_m)
+
+
+def _places(read: np.ndarray, axis: int) -> np.ndarray:
+    """Return the lines before which a slip is tested: at least one line was read on either side."""
+    lines = np.flatnonzero(read.any(axis=1 - axis))
+    inner = lines[1:]
+    if len(inner) <= MAX_PLACES:
+        return inner
+    return inner[np.linspace(0, len(inner) - 1, MAX_PLACES).round().astype(int)]
+
+
+def _explained(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
+               place: int) -> float | None:
+    """Return the sum of squares that a slip explains, m^2; None where it cannot be tested."""
+    system = residuals.problem.system
+    grid = system.grid
+    after = grid.read[v].copy()
+    after[(slice(0, place), slice(None))[::1 - 2 * axis]] = False
+    if after.sum() < 3 or (grid.read[v] & ~after).sum() < 3:
+        return None
+    columns = np.zeros((3, *grid.weight.shape), dtype=complex)
+    columns[0, v], columns[1, v], columns[2, v] = (
+        shape * after for shape in (1j * grid.views.z, np.ones_like(grid.views.z),
+                                    np.full_like(grid.views.z, 1j)))
+    projected = np.array([grid_residuals(system, column) for column in columns])
+    normal = np.einsum("avij,bvij,vij->ab", np.conj(projected), projected, grid.weight).real
+    if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
+        return None
+    right = np.einsum("avij,vij,vij->a", np.conj(projected), clipped, grid.weight).real
+    return float(right @ np.linalg.solve(normal, right))
+
+
+def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
+    """Return the measurement with the view as two placements, before and after the slip.
+
+    Its angular lines become a third placement: the time of their reading is unknown.
+    """
+    view = measurements.views[slip.index]
+    after = getattr(view, slip.axis) >= slip.first
+    parts = [_grid_part(view, ~after, ""), _grid_part(view, after, " after slip")]
+    if len(view.k):
+        lines = replace(view.view, name=view.view.name + " lines", grid=False)
+        parts.append(replace(ViewReadings(lines), k=view.k, dtheta=view.dtheta,
+                             count_theta=view.count_theta, u_theta=view.u_theta,
+                             sigma_theta=view.sigma_theta, dof_theta=view.dof_theta))
+    views = (*measurements.views[:slip.index], *parts, *measurements.views[slip.index + 1:])
+    return replace(measurements, views=views)
+
+
+def _grid_part(view: ViewReadings, keep: np.ndarray, suffix: str) -> ViewReadings:
+    named = replace(view.view, name=view.view.name + suffix, angular=False)
+    used = int(view.count[keep].sum())
+    return ViewReadings(named, view.m[keep], view.n[keep], view.dx[keep], view.dy[keep],
+                        view.count[keep], view.u[keep] if len(view.u) else view.u,
+                        sigma_xy=view.sigma_xy, dof_xy=int(view.dof_xy * keep.mean()), used=used,
+                        rejected={} if suffix else view.rejected,
+                        visits=None if view.visits is None else view.visits.of_marks(keep))
+
+
+def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> Cause | None:
+    """Return the term that explains the residuals better than a slip; None if the slip does.
+
+    Raises
+    ------
+    NotIdentifiableError, InputError
+        As `selfcal_ros.estimation.api.calibrate`.
+    """
+    model = fit_joint(measurements, options)
+    problem, axis = model.problem, "mn".index(slip.axis)
+    row, shape = problem.grid.index.index(slip.index), problem.ground.z.shape
+    after = np.indices(shape)[axis] - shape[axis] // 2 >= slip.first
+    found = find_explanations(model, slips=True, readings=False, placed=PlacedSlip(
+        row, after & (problem.ground.weight[row] > 0), 2 * MAX_PLACES))
+    if not found or found[0].name == SLIP:
+        return None
+    return cause_of(found[0], problem.ground)
+
 
 OUTLIER_LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""

@@ -4,23 +4,44 @@
 Small residuals prove nothing; a prediction can fail. A tenth of the readings, or a whole view, is
 held out, the rest is calibrated, and the readings held out are predicted. The three misalignments
 of a whole view are fitted to its readings first, as no calibration can know them.
+
+Distribution of the prediction error of readings that were held out of a fit.
+
+The error comes from the noise of the reading, from the error of the fit, and in a view that was
+held out as a whole from its own terms within their sizes. Its sum of squares over the noise is a
+weighted sum of chi^2; seeded draws of unit noise through the same fit give mean and variance, and
+with these a scaled chi^2 (Satterthwaite), or F, as the noise is estimated.
+
+Microscope and direction of approach are shared by all views. Drift, plate and circle of lines have
+coefficients for each view, which are estimated only if some of its readings were fitted; for a view
+that was held out as a whole they are known within their sizes.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import fdtri
 
+from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import (
     InputError,
     NoDataError,
     NotIdentifiableError,
     NotSettledError,
 )
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import FLOOR
-from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
-from selfcal_ros.estimation.joint.solved import Solved
-from selfcal_ros.estimation.lattice.readings import angular_data, pose_of
+from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
+from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess
+from selfcal_ros.estimation.lattice.readings import (
+    AngularData,
+    GridData,
+    angular_data,
+    grid_data,
+    pose_of,
+)
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.equations import Marks, lines_of
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     smaller,
@@ -28,18 +49,291 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.observability.suggest import FULL_SIZE, SEARCH_SIZE
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality.prediction import (
-    HeldReadings,
-    held_readings,
-    line_errors,
-    prediction_errors,
-    prediction_limit,
-)
-from selfcal_ros.model.error_map import ThetaDatum, rms
+from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_columns
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, reduce_columns
+from selfcal_ros.estimation.terms.places import places_of
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
+from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
+
+PREDICTION_LEVEL = 1e-3
+"""Probability that the prediction error of good readings exceeds its limit."""
+
+DRAWS = 200
+"""Number of draws in a small field: 10 % uncertainty of the degrees of freedom."""
+
+READINGS_DRAWN = 2_000_000
+"""Largest number of readings in all draws together: larger fields vary less."""
+
+MIN_DRAWS = 16
+
+RIGID_STEPS = 8
+"""Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
+
+TOGETHER = 20_000
+"""Number of readings computed at once: several draws of a small field, one of a large one."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldReadings:
+    """Grid readings that were held out, and the columns of the fitted terms at them.
+
+    Attributes
+    ----------
+    grid : GridData
+        The readings; `index` are positions in the whole measurement.
+    columns : complex array (p, views, nx, ny)
+        Effect of a unit of each fitted coefficient on them, plate frame.
+    rows : tuple of int
+        Row of each of their views in the fit; -1 if it was not fitted.
+    own : complex array (q, views, nx, ny)
+        Effect on them of one standard deviation of each coefficient with a size that belongs to a
+        view that was not fitted, plate frame, m.
+    moved : complex array (views, nx, ny)
+        Effect on them of the stage's distance from the sites, plate frame, m.
+    """
+
+    grid: GridData
+    columns: np.ndarray
+    rows: tuple[int, ...]
+    own: np.ndarray
+    moved: np.ndarray
+
+
+def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> HeldReadings:
+    """Return the grid readings `held` with the columns of the terms that `kept` was fitted with."""
+    problem, grid = model.problem, grid_data(held)
+    rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1
+                 for i in grid.index)
+    ground = ground_of(held, grid, problem.half_width_m)
+    places = places_of(held, grid, ground, problem.system.known_sites)
+    moved: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
+    if problem.moves and places is not None:
+        moved = places.changes(places.moved(model.found.field), np.zeros(len(grid.index)))
+    equations = model.equations
+    n = 0 if equations is None else equations.n
+    out: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
+    own = [out[:0]]
+    if equations is not None:
+        ground = _in_time_of(ground, grid, kept, held)
+        columns = term_columns(ground, problem.terms)
+        at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
+        for column, block in zip(columns.columns, columns.grid, strict=True):
+            if block_of(column.term).of_lines:
+                continue  # its views are those with lines, and no mark has a part of it
+            shared = column.view == -1
+            row = -1 if shared else _fitted_row(problem.ground, ground, rows, column.view)
+            if row < 0 and not shared:
+                own.append(np.where(np.isfinite(column.size), column.size, 0.0) * block[None])
+            elif (key := (column.term, row, column.component)) in at:
+                out[at[key]] += block
+    return HeldReadings(grid, out, rows, np.concatenate(own), moved)
+
+
+def _fitted_row(fitted: TermInputs, held: TermInputs, rows: tuple[int, ...], first: int) -> int:
+    """Return the first view of a placing in the fit; -1 if no view of it was fitted."""
+    known = [rows[view] for view in held.members[first] if rows[view] >= 0]
+    return next(first for first, members in fitted.members.items()
+                if known[0] in members) if known else -1
+
+
+def _in_time_of(ground: TermInputs, grid: GridData, kept: Measurements,
+                held: Measurements) -> TermInputs:
+    """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
+    visits: list[ViewVisits | None] = []
+    placings = ground.placings or range(len(ground.names))
+    ranges = time_ranges([kept.views[index] for index in grid.index], placings)
+    for index, placing, view in zip(grid.index, placings, ground.visits, strict=True):
+        own = held.views[index].visits
+        if view is None or own is None or placing not in ranges:
+            visits.append(view)
+            continue
+        first, last = ranges[placing]
+        time = 2 * (own.stamp_ns - first) / max(last - first, 1) - 1
+        visits.append(replace(view, time=time))
+    return replace(ground, visits=tuple(visits))
+
+
+def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
+    """Return the errors of prediction of held grid readings, complex (views, nx, ny), m.
+
+    Plate frame; NaN where a mark was not held, or cannot be predicted. A misalignment that the
+    solution does not know is that which fits the errors best.
+    """
+    model, result = solved.joint, solved.result
+    problem, system = model.problem, model.problem.system
+    views = maps_of(system.grid.views.plate_shape, held.grid.poses)
+    known = (held.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
+    plate, marks = model.found.plate, views.z * problem.half_width_m
+    error = held.grid.y - held.moved - np.tensordot(model.coefficients, held.columns, axes=1)
+    error = np.where(known, error - views.gather(model.found.field) - plate, complex(np.nan))
+    for one, here, index, pose in zip(error, known, held.grid.index, held.grid.poses, strict=True):
+        view = result.views[index]
+        phi, tau = view.phi, complex(view.tx, view.ty) * pose.phase.conjugate()
+        if not np.isfinite([phi, view.tx, view.ty]).all():
+            phi, tau = _fitted_placing(one[here], marks[here], plate[here],
+                                       steps=RIGID_STEPS if problem.rigid else 0)
+        if problem.rigid:
+            one -= rotation_excess(phi, marks, plate)
+        one -= 1j * phi * marks + tau
+    return error
+
+
+def _fitted_placing(errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *,
+                    steps: int) -> tuple[float, complex]:
+    """Return rotation, rad, and offset, plate frame, m, that fit errors; NaN of too few, (P,)."""
+    if len(errors) < 3:
+        return np.nan, complex(np.nan)
+    phi, x, y = fitted_misalignment(marks, errors[:, None])[:, 0]
+    for _ in range(steps):
+        rest = errors - rotation_excess(phi, marks, plate)
+        phi, x, y = fitted_misalignment(marks, rest[:, None])[:, 0]
+    return float(phi), complex(x, y)
+
+
+def line_errors(solved: Solved, held: AngularData) -> np.ndarray:
+    """Return the errors of prediction of held readings of lines, (views, K), rad.
+
+    As of `prediction_errors`; of terms of the lines where any line of their view was fitted.
+    """
+    model = solved.joint
+    system, found, fitted = model.problem.system, model.found, model.problem.angular.index
+    field = np.where(system.known_lines, found.g_theta, np.nan)
+    plate = np.where((held.weight > 0) & system.known_plate_lines, found.a_theta, np.nan)
+    lines = lines_of(Marks(held.turns, held.weight, held.index, held.harmonics))
+    error = held.y - lines.gather(field) - plate
+    terms = NO_LINES if model.equations is None else model.equations.columns.lines
+    for one, index in zip(error, held.index, strict=True):
+        if index in fitted and len(terms.at):
+            one -= model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
+        phi = solved.result.views[index].phi
+        if not np.isfinite(phi) and np.isfinite(one).any():
+            phi = np.nanmean(one)
+        one -= phi
+    return error
+
+
+@dataclass(frozen=True)
+class PredictionLimit:
+    """Distribution of the mean square of scaled prediction errors for unit noise.
+
+    `mean` and `dof` are those of the scaled chi^2 with the same mean and variance.
+    """
+
+    mean: float
+    dof: float
+
+    def ratio(self, noise_dof: float) -> float:
+        """Return the ratio of error to noise that is exceeded with probability PREDICTION_LEVEL."""
+        dof = min(noise_dof, MANY_DOF)
+        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - PREDICTION_LEVEL)))
+
+
+def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
+                     weight: np.ndarray) -> PredictionLimit:
+    """Return the distribution of the prediction error of held-out grid readings.
+
+    Parameters
+    ----------
+    model : ModelFit
+        The fit without them.
+    held : HeldReadings
+        The readings that are predicted.
+    known : bool array (views, nx, ny)
+        Which of them can be predicted.
+    weight : float array (views, nx, ny)
+        Their weights.
+    """
+    grid = model.problem.system.grid
+    n = int(np.clip(READINGS_DRAWN // grid.weight.size, MIN_DRAWS, DRAWS))
+    rng = np.random.default_rng(0)
+    noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
+    fields, parameters, coefficients = _fitted(model, noise, rng)
+    own = noise_of(rng, (n, *weight.shape), weight)
+    own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
+    views = maps_of(grid.views.plate_shape, held.grid.poses)
+    squares = np.zeros(n)
+    step = max(TOGETHER // grid.weight.size, 1)
+    for draws in (slice(first, first + step) for first in range(0, n, step)):
+        field = fields[:, draws].T.reshape(-1, *grid.views.shape)
+        taken = noise[draws]
+        if model.equations is not None:
+            taken = taken - _of_terms(coefficients[:, draws], model.equations.columns.grid)
+        plate = grid.plate(taken, field, parameters[:, draws].T)[0]
+        misaligned = grid.misaligned(parameters[:, draws].T)
+        error = own[draws] - views.gather(field) - plate[:, None]
+        if len(coefficients):
+            error = error - _of_terms(coefficients[:, draws], held.columns)
+        if len(held.own):
+            error = error + _of_terms(own_terms[:, draws], held.own)
+        for row, fitted in enumerate(held.rows):
+            if fitted >= 0:
+                error[:, row] -= misaligned[:, fitted]
+                continue
+            z, here = views.z[known[row]], error[:, row, known[row]]
+            phi, *tau = fitted_misalignment(z, here.T)[:, :, None]
+            error[:, row, known[row]] = here - 1j * phi * z - (tau[0] + 1j * tau[1])
+        each = np.ascontiguousarray((weight * abs(error) ** 2)[:, known])
+        squares[draws] = each.sum(axis=1) / (2 * known.sum())
+    mean = float(squares.mean())
+    return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
+
+
+def _of_terms(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the effect of coefficients (p, k) on the readings, complex (k, views, nx, ny)."""
+    return np.array([np.tensordot(one, columns, axes=1) for one in coefficients.T])
+
+
+def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+    """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
+    root = np.sqrt(np.where(weight > 0, weight, 1.0))
+    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
+    return both[0] + 1j * both[1]
+
+
+def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
+            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit k draws of unit noise: maps (sites, k), misalignments (3 views, k), terms (p, k)."""
+    problem = model.problem
+    grid, n = problem.system.grid, 3 * problem.system.grid.n_views
+    found = model.found
+    inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
+    reduced = reduce_columns(grid, shapes_in_full(noise))
+    parameters = inverse[:n, :n] @ reduced.right
+    fields = reduced.free - grid.response @ parameters
+    if model.equations is None:
+        return fields, parameters, np.zeros((0, len(noise)))
+    now = equations_of(problem, found, model.equations.columns, model.reduced)
+    columns = now.columns.grid.reshape(now.n, -1)
+    right = np.zeros((now.n, len(noise)))
+    for draw, one in enumerate(noise):
+        field = fields[:, draw].reshape(grid.views.shape)
+        residual = grid.plate(one, field, parameters[:, draw])[1]
+        right[:, draw] = (np.conj(columns) @ (grid.weight * residual).ravel()).real
+    values, vectors = np.linalg.eigh(now.columns.within.gram)
+    within = vectors * np.sqrt(np.maximum(values, 0.0))
+    right += within @ rng.standard_normal((now.n, len(noise)))
+    feigned = np.sqrt(now.position_noise)[:, None]
+    right = now.unbiased_sums(right + feigned * rng.standard_normal((now.n, len(noise))))
+    # a term with a size is not 0: its estimate minus its value is drawn
+    prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
+    right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
+    coefficients = now.inverse(found.xy.sigma) @ right
+    return (fields - now.projected.fields @ coefficients,
+            parameters - now.projected.parameters[:n] @ coefficients, coefficients)
+
+
+def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return phi, Re and Im tau, (3, k), that fit errors, complex (P, k), at marks (P,) best."""
+    columns = np.stack([1j * marks, np.ones_like(marks), np.full_like(marks, 1j)], axis=1)
+    rows = np.concatenate([columns.real, columns.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    values = np.concatenate([errors.real, errors.imag])
+    return np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale[:, None]
+
 
 MAX_FOLDS = 10
 

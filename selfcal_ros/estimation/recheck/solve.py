@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views of a known plate to a result: the map of the stage, its uncertainty, what has changed."""
+"""Views of a known plate to a result: the map of the stage, its uncertainty, what has changed.
+
+Predictions for views of a known plate, before any is measured.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +14,7 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
-from selfcal_ros.estimation.datum.angular import Conditions
+from selfcal_ros.estimation.datum.covariance import Conditions
 from selfcal_ros.estimation.joint.images import stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -22,16 +25,15 @@ from selfcal_ros.estimation.joint.problem import (
     noise_estimate,
     problem_of,
 )
-from selfcal_ros.estimation.joint.solve import views_of
-from selfcal_ros.estimation.joint.solved import noise_of
+from selfcal_ros.estimation.joint.solve import noise_of, views_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.systems import system_for
+from selfcal_ros.estimation.normal.equations import system_for
+from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
-from selfcal_ros.estimation.recheck.plate import KnownPlate, on_plate
-from selfcal_ros.estimation.recheck.same_plate import check_plate
+from selfcal_ros.estimation.recheck.plate import KnownPlate, check_plate, on_plate
 from selfcal_ros.estimation.recheck.views import (
     NOISE,
     PLATE,
@@ -51,12 +53,12 @@ from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
-from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
-from selfcal_ros.model.view import cells_seen
+from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
 
 MOST_OF_IMAGES = 3200
 """Largest number of readings of images: their covariance is dense, 8 bytes (2 n)^2."""
@@ -370,3 +372,55 @@ def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
                          source, details)
     yield from (line for line in budget_lines(result)
                 if (line.quantity, line.component) == ("xy", INTERPOLATION))
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRecheck:
+    """Predicted uncertainties, in units of the noise of one averaged reading.
+
+    Attributes
+    ----------
+    map : Prediction
+        Of the new map.
+    change : float
+        Of the change of a coordinate, rms over the nodes.
+    """
+
+    map: Prediction
+    change: float
+
+
+@one_thread()
+def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
+    """Return the predictions for views of a known plate, with the noise of its calibration.
+
+    Raises
+    ------
+    NotIdentifiableError, InputError
+        As `selfcal_ros.estimation.recheck.solve.recheck`.
+    """
+    readings = Measurements(plan.plan_id, plan.artifact, tuple(
+        _planned(view, plan) for view in with_sub_views(plan.views)))
+    found: Rechecked = recheck_of(readings, Options(assumed=(), misalignment_model="linear"), plate)
+    noise = plate.result.noise
+    root = np.sqrt(min(view.repeats for view in plan.views))
+    unit = noise.sigma_xy / root
+    emap = found.error_map()
+    u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
+    return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
+                          rms(map_change(found.new, found.artifact, plate).u) / unit)
+
+
+def _planned(view: View, plan: Plan) -> ViewReadings:
+    """Return the readings of a view, all 0."""
+    out, artifact = ViewReadings(view), plan.artifact
+    if view.grid:
+        read = view.pose.in_field(artifact)
+        nothing = np.zeros(int(read.sum()))
+        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
+                      count=np.full(len(nothing), view.repeats))
+    if view.angular and artifact.angular_count:
+        lines = np.arange(artifact.angular_count)
+        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
+                      count_theta=np.full(len(lines), view.repeats))
+    return out

@@ -16,14 +16,19 @@ from scipy.linalg import solve_triangular
 
 from selfcal_ros.blocks import Block
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
-from selfcal_ros.estimation.joint.fit import Moving
-from selfcal_ros.estimation.joint.problem import Problem
-from selfcal_ros.estimation.joint.solved import MICROSCOPE_PARTS
+from selfcal_ros.estimation.joint.problem import Moving, Problem
+from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.normal.angular import HarmonicSystem
-from selfcal_ros.estimation.normal.placed import CORE, KNOWN, VAGUE, PlacedSystem
-from selfcal_ros.estimation.normal.systems import Marks, lines_of
+from selfcal_ros.estimation.normal.equations import (
+    CORE,
+    KNOWN,
+    VAGUE,
+    Marks,
+    PlacedSystem,
+    lines_of,
+)
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import Observability

@@ -1,20 +1,232 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The equations of the terms' coefficients: which are determined, their values and covariance."""
+"""The equations of the terms' coefficients: which are determined, their values and covariance.
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+Columns projected by the estimate of map, plate and misalignments: effects and residuals.
+
+The estimate without terms is linear: y -> (G, misalignments) with residuals (1 - P) y. A term's
+column c has the map F = G(c) and the residuals r = (1 - P) c. The terms then follow by
+partitioned regression (Frisch and Waugh):
+    (r'W c + within + sigma^2/size^2) b = c'W e + within,
+    G = G(y) - F b,     cov G = S + F cov(b) F'
+With the marks, then the sites (matrix M, right-hand side s), then the misalignments (right-hand
+side d, covariance C) eliminated, r'W c = c'W c - mean' W mean - s' M^-1 s - d' C d. Up to the last
+step everything is linear over the complex numbers and done for the shapes of the columns.
+
+Whether the readings determine the terms of the model, and agree with their given sizes.
+
+The coefficients of a term, estimated without their size, have b ~ N(0, C + size^2 1), with
+C their covariance (method eq. 7.9). If this is contradicted, the readings give another size:
+that at which b' (C + size^2 1)^-1 b equals its rank (Paule and Mandel 1982), and at most that at
+which it is improbably small.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import chdtri, fdtrc
 
+from selfcal_ros.blocks import block_of, blocks
+from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.terms.columns import TermColumns
-from selfcal_ros.estimation.terms.projection import (
-    ProjectedColumns,
-    ReducedColumns,
-    project,
-    reduce_columns,
-)
+from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
+from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
+from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.terms import ModelTerm
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedColumns:
+    """Columns with the sites eliminated, independent of the angular readings.
+
+    Attributes
+    ----------
+    grid : GridSystem
+        The measured plan.
+    shapes : Shapes
+        The columns, p of them, of q shapes.
+    sites : complex array (sites, q)
+        Right-hand side s of every shape.
+    inner : complex array (q, q)
+        Weighted inner products of the shapes' residuals after marks and sites.
+    asked : complex array (2 views, q)
+        Coupling of the shapes to rotation and offset of every view, sites eliminated.
+    """
+
+    grid: GridSystem
+    shapes: Shapes
+    sites: np.ndarray
+    inner: np.ndarray
+    asked: np.ndarray
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """M^-1 s of every column, complex (sites, p)."""
+        return self.shapes.of_columns(self.grid.factor.solve(self.sites))
+
+    @cached_property
+    def right(self) -> np.ndarray:
+        """Right-hand side of the misalignments, (3 views, p)."""
+        return of_misalignments(self.shapes.of_columns(self.asked))
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """Weighted inner products of the columns' residuals after marks and sites, (p, p)."""
+        return self.shapes.products(self.inner)
+
+
+def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
+    """Return columns with the sites eliminated."""
+    sites, inner, asked = _marks_eliminated(grid, shapes)
+    inner -= grid.factor.products(sites)
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
+                          asked - _coupled(grid, sites))
+
+
+def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
+                rows: np.ndarray) -> ReducedColumns:
+    """Return columns with the sites eliminated, if only `rows` have changed.
+
+    Parameters
+    ----------
+    grid : GridSystem
+        The measured plan.
+    shapes : Shapes
+        The columns.
+    before : ReducedColumns
+        The previous columns.
+    rows : bool array (p,)
+        Columns to recompute, with all others of the same shapes.
+    """
+    changed = np.unique(shapes.of_column[rows])
+    sites, fresh, asked = _marks_eliminated(grid, shapes)
+    free = grid.factor.solve(np.ascontiguousarray(sites[:, changed]))
+    inner, asked_before = before.inner.copy(), before.asked.copy()
+    inner[changed] = fresh[changed] - free.conj().T @ sites
+    inner[:, changed] = inner[changed].conj().T
+    asked_before[:, changed] = asked[:, changed] - _coupled(grid, sites[:, changed])
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2, asked_before)
+
+
+def _marks_eliminated(grid: GridSystem, shapes: Shapes
+                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return s (sites, q), inner products (q, q) and the coupling to the views (2 views, q)."""
+    n, marks = grid.n_views, grid.n_marks
+    weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
+    to_views = grid.shapes.reshape(2, marks).conj()
+    means: np.ndarray = np.zeros((shapes.n, marks), dtype=complex)
+    sites: np.ndarray = np.zeros((shapes.n, *grid.views.shape), dtype=complex)
+    inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
+    asked: np.ndarray = np.zeros((n, 2, shapes.n), dtype=complex)
+    for v, (rows, values) in enumerate(zip(shapes.rows, shapes.values, strict=True)):
+        weighted = values * weight[v]
+        means[rows] += values * part[v]
+        inner[rows[:, None], rows] += values.conj() @ weighted.T
+        asked[v][:, rows] += to_views @ weighted.T
+        here = np.zeros((len(rows), *grid.views.shape), dtype=complex)
+        grid.views.add_scattered(here, v, weighted.reshape(len(rows), *shapes.lattice))
+        sites[rows] += here
+    # minus the mean of each mark, which all views share
+    inner -= (means * weight.sum(axis=0)).conj() @ means.T
+    asked -= (to_views * weight[:, None]) @ means.T
+    for v in range(n):
+        grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice))
+    return (np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T), inner,
+            asked.reshape(2 * n, shapes.n))
+
+
+def _coupled(grid: GridSystem, sites: np.ndarray) -> np.ndarray:
+    """Return the coupling of M^-1 s to rotation and offset of every view, complex (2 views, k)."""
+    answers = grid.response.reshape(grid.n_sites, grid.n_views, 3)[:, :, :2]
+    return answers.reshape(grid.n_sites, -1).conj().T @ sites
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedColumns:
+    """Effect of each column on the estimate, in no particular datum.
+
+    Attributes
+    ----------
+    make_fields : callable
+        Returns `fields`, which are rarely needed.
+    parameters : float array (size, p)
+        Misalignments, as in `NormalEquations`.
+    gram : float array (p, p)
+        Weighted inner products of columns and residuals, c' W r.
+    turned : float array (K, p)
+        Angular map of each column, sign reversed, rad.
+    """
+
+    make_fields: Callable[[], np.ndarray]
+    parameters: np.ndarray
+    gram: np.ndarray
+    turned: np.ndarray
+
+    @cached_property
+    def fields(self) -> np.ndarray:
+        """Map F, complex (sites, p)."""
+        return self.make_fields()
+
+    def of_lines(self, system: NormalEquations, lines: LineColumns,
+                 half_width_m: float) -> np.ndarray:
+        """Return the angular residuals of the columns, (views, K, p), rad."""
+        angular = system.angular
+        phi = self.parameters[system.phi_at] / half_width_m
+        out = angular.gather(self.turned) - phi[:, None]
+        if len(lines.at):
+            out[:, :, lines.at] += np.moveaxis(lines.values, 0, -1)
+        return np.where(angular.read[:, :, None], angular.centred(out), 0.0)
+
+
+def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
+            lines: LineColumns, *, ratio: float, half_width_m: float) -> ProjectedColumns:
+    """Return the effect of the columns on the joint estimate.
+
+    Parameters
+    ----------
+    system : NormalEquations
+        The measured plan.
+    reduced : ReducedColumns
+        The columns with the sites eliminated.
+    inverse : float array (size, size)
+        Covariance of the misalignments for unit noise of one grid reading.
+    lines : LineColumns
+        The columns of lines; a reading has the weight `ratio` times `half_width_m` squared.
+    ratio, half_width_m : float
+        Weight of a line, and the unit of the misalignments, m.
+    """
+    angular, n = system.angular, 3 * system.grid.n_views
+    right = np.zeros((system.size, reduced.right.shape[1]))
+    right[:n] = reduced.right
+    free, of_lines, gram_of_lines = _lines_eliminated(angular, lines)
+    right[np.ix_(system.phi_at, lines.at)] += ratio * half_width_m * of_lines
+    parameters = inverse @ right
+    gram = reduced.gram - right.T @ parameters
+    gram[np.ix_(lines.at, lines.at)] += ratio * half_width_m**2 * gram_of_lines
+    turned = angular.response @ parameters[system.phi_at] / half_width_m
+    turned[:, lines.at] -= free
+    return ProjectedColumns(lambda: reduced.free - system.grid.response @ parameters[:n],
+                            parameters, (gram + gram.T) / 2, turned)
+
+
+def _lines_eliminated(angular: AngularSystem,
+                      lines: LineColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what q columns make of the stage's lines, (K, q), and right-hand side and products.
+
+    Of the misalignments, (views, q), and of the residuals, (q, q).
+    """
+    if not len(lines.at):
+        return np.zeros((angular.n_lines, 0)), np.zeros((angular.n_views, 0)), np.zeros((0, 0))
+    values = np.moveaxis(lines.values, 0, -1)
+    weighted = angular.weight[:, :, None] * angular.centred(values)
+    lines_right = angular.scatter(weighted)
+    free = angular.solve(lines_right)
+    gram = np.einsum("vkp,vkq->pq", values, weighted) - lines_right.T @ free
+    return free, weighted.sum(axis=1) - angular.columns.T @ free, (gram + gram.T) / 2
+
 
 UNTOLD = 1e-9
 """Relative size below which an eigenvalue of the scaled equations is zero."""
@@ -420,3 +632,232 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     values, vectors = np.linalg.eigh(rest / np.outer(own, own))
     out.append((FREE, own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
     return out
+
+
+SIZE_LEVEL = 5e-4
+"""Level of the test of each size."""
+
+DOUBT_LEVEL = 0.1
+"""Level below which the readings make a size doubtful, and a larger one is used instead: its upper
+limit with as much confidence, which is far above what few coefficients show."""
+
+BISECTIONS = 60
+"""Steps, on a logarithmic scale, to find a size to rounding."""
+
+TAIL = (1 - 0.9545) / 2
+"""Probability of a small statistic below which a size is too large."""
+
+
+@dataclass(frozen=True)
+class SizeTest:
+    """The size of a term compared with the readings.
+
+    Attributes
+    ----------
+    name : str
+        The term.
+    given : float
+        Its size, SI unit of the term; the largest one of a microscope.
+    shown, allowed : float
+        The size shown by the readings, and the largest that they allow: the upper one of two limits
+        with a coverage of 95.45 % if they contradict the given size, the limit of `DOUBT_LEVEL` if
+        they make it doubtful; otherwise the given size.
+    statistic : float
+        b' (C + size^2 1)^-1 b of all coefficients; `rank` on average.
+    rank : int
+        Number of their combinations determined by the readings.
+    p_together : float
+        Probability of as large a value if the size is right.
+    p : float
+        The same of whichever is the least likely: of all coefficients, or of a family of them.
+    evidence : float
+        Logarithm of how much likelier the readings are with the size that they show (ratio of
+        marginal likelihoods); 0 if they do not make the given one doubtful.
+    """
+
+    name: str
+    given: float
+    shown: float
+    allowed: float
+    statistic: float
+    rank: int
+    p_together: float
+    p: float
+    evidence: float = 0.0
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the readings rule out the size as too small."""
+        return self.p < SIZE_LEVEL
+
+    @property
+    def raised(self) -> bool:
+        """Whether the readings make the size doubtful, or rule it out: a larger one is used."""
+        return self.p < DOUBT_LEVEL
+
+
+def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
+              noise: tuple[float, float]) -> SizeTest:
+    """Return the test of one size, the other terms with their sizes or free.
+
+    The test of all its coefficients, or of those of one family (`Block.families`): whichever
+    contradicts the size more, at the level of all of them together.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The columns of all terms.
+    right : float array (p,)
+        Inner products c' W y of all columns with the readings, without coefficients subtracted.
+    term : ModelTerm
+        With a size.
+    noise : tuple of float
+        Noise of one grid reading, m, and its degrees of freedom.
+    """
+    columns = equations.columns.columns
+    every = equations.rows([term.name])
+    families = [every & np.array([column.component in family for column in columns])
+                for family in term.block.families]
+    whole, *parts = [_coefficients_test(equations, right, term, noise, rows=rows,
+                                        among=1 + len(families))
+                     for rows in (every, *families)]
+    return replace(min((whole, *parts), key=lambda test: test.p), rank=whole.rank,
+                   statistic=whole.statistic, p_together=whole.p_together)
+
+
+def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
+                       noise: tuple[float, float], *, rows: np.ndarray, among: int) -> SizeTest:
+    """Return the test of a size by the coefficients `rows`, bool (p,), one of `among` tests."""
+    sigma, dof = noise
+    values, variance, of_size = _told(equations, right, rows, sigma)
+    rank = len(values)
+
+    def spread(size: float) -> np.ndarray:
+        return np.diag(variance) + size**2 * of_size
+
+    def statistic(size: float) -> float:
+        return float(values @ np.linalg.solve(spread(size), values))
+
+    if not rank:
+        return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
+    found = statistic(term.size)
+    p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
+    test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p, min(1.0, among * p))
+    if not test.raised:
+        return test
+    # b'b / (size^2 the smallest eigenvalue) is not below it
+    beyond = np.sqrt(values @ values / np.linalg.eigvalsh(of_size)[0])
+
+    def size_at(level: float) -> float:
+        low, high = term.size, float(beyond / np.sqrt(level))
+        for _ in range(BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if statistic(middle) > level else (low, middle)
+        return high
+
+    tail = TAIL if test.contradicted else DOUBT_LEVEL
+    shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
+    wider = np.linalg.slogdet(spread(shown))[1] - np.linalg.slogdet(spread(term.size))[1]
+    return replace(test, shown=shown, allowed=allowed,
+                   evidence=float(found - statistic(shown) - wider) / 2)
+
+
+def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the estimates of coefficients taken as free.
+
+    The determined combinations, scaled by the columns' norms, (r,), their variances from the
+    noise, (r,), and their covariance for a largest size of 1, (r, r).
+    """
+    rest = ~rows
+    prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
+    norm = np.hypot(equations.norm, prior)
+    scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
+    hidden = equations.untold(equations.free & rest)[rest]
+    held = np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True,
+                          rcond=1e-14) - hidden @ hidden.T
+    couple, scores = scaled[np.ix_(rows, rest)] @ held, equations.unbiased_sums(right) / norm
+    told_by = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(rest, rows)]
+    size, vectors = np.linalg.eigh((told_by + told_by.T) / 2)
+    told = size > equations.limit(rows)
+    vectors, size = vectors[:, told], size[told]
+    values = vectors.T @ (scores[rows] - couple @ scores[rest]) / size
+    own = equations.columns.size[rows]
+    turned = vectors * (norm[rows] * own / own.max())[:, None]
+    return values, sigma_m**2 / size, turned.T @ turned
+
+
+def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
+               noise: tuple[float, float]) -> tuple[SizeTest, ...]:
+    """Return the tests of all sizes, raised ones first, in the order of their evidence.
+
+    Each is tested with the preceding terms at the sizes that the readings allow, so that one term
+    does not make others appear too small.
+
+    Parameters
+    ----------
+    equations, right, noise
+        As in `size_test`.
+    terms : sequence of ModelTerm
+        All terms.
+    """
+    found: list[SizeTest] = []
+    sized = [term for term in terms if not term.free and equations.rows([term.name]).any()]
+    if not np.isfinite(noise[0]):
+        return ()
+    while sized:
+        tests = [size_test(equations, right, term, noise) for term in sized]
+        failed = [test for test in tests if test.raised]
+        if not failed:
+            return (*found, *tests)
+        worst = max(failed, key=lambda test: test.evidence)
+        found.append(worst)
+        sized = [term for term in sized if term.name != worst.name]
+        equations = replace(equations, columns=equations.columns.scaled(
+            worst.name, worst.allowed / worst.given))
+    return tuple(found)
+
+
+def unseen_by_term(equations: TermEquations) -> dict[str, int]:
+    """Return, for each free term that is not separable from the stage, the modes that it hides.
+
+    Terms that are not separable only in combination are all named, with the modes hidden together.
+    """
+    free = {column.term for column in equations.columns.columns if column.size == float("inf")}
+    out = {}
+    for name in blocks():
+        if name in free:
+            modes = equations.unseen(equations.rows([name])).shape[1]
+            if modes:
+                out[name] = modes
+    together = equations.unseen(equations.free).shape[1]
+    if together and not out:
+        out = {name: together for name in blocks() if name in free}
+    return out
+
+
+def require_terms_told(equations: TermEquations, seen: Observability) -> None:
+    """Raise NotIdentifiableError if free terms hide modes of the stage.
+
+    Parameters
+    ----------
+    equations : TermEquations
+        The terms.
+    seen : Observability
+        Observability without terms.
+    """
+    modes = equations.unseen(equations.free).shape[1]
+    if not modes:
+        return
+    by_term = unseen_by_term(equations)
+    texts = tuple(f"{name}: {count} mode{'s' * (count != 1)} of the stage look like it"
+                  for name, count in by_term.items())
+    advice = tuple(f"{name}: {block_of(name).cure}, or give it a size, as in {name}:SIZE"
+                   for name in by_term)
+    free = int(equations.free.sum())
+    found = replace(seen, unknowns=seen.unknowns + free, rank=seen.rank + free - modes,
+                    deficiency=seen.deficiency + modes, identifiable=False, modes=texts,
+                    advice=advice)
+    raise NotIdentifiableError(
+        f"the readings do not separate {' and '.join(by_term)} from the stage "
+        f"({modes} mode{'s' * (modes != 1)} undetermined): " + "; ".join(advice), found)

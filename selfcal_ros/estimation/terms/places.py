@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
-from selfcal_ros.estimation.lattice.maps import LatticeViews
-from selfcal_ros.estimation.lattice.placed import maps_of
+from selfcal_ros.estimation.lattice.maps import LatticeViews, maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.error_map import rms

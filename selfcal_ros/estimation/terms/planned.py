@@ -15,10 +15,12 @@ from scipy.special import ndtri
 from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
-from selfcal_ros.estimation.terms.columns import Column, TermColumns, term_columns
-from selfcal_ros.estimation.terms.equations import TermEquations, equations_of_columns
-from selfcal_ros.estimation.terms.projection import ProjectedColumns
-from selfcal_ros.estimation.terms.shapes import WithinMarks
+from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks, term_columns
+from selfcal_ros.estimation.terms.equations import (
+    ProjectedColumns,
+    TermEquations,
+    equations_of_columns,
+)
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose

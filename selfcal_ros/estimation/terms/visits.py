@@ -16,7 +16,7 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.lattice.placed import maps_of
+from selfcal_ros.estimation.lattice.maps import maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import Pose

@@ -21,17 +21,14 @@ from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
-from selfcal_ros.estimation.datum.angular import MISCLOSURE_LEVEL
-from selfcal_ros.estimation.joint.finer import is_untested
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
+from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
+from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, is_untested
 from selfcal_ros.estimation.joint.problem import NoiseEstimate
-from selfcal_ros.estimation.joint.solve import fit_joint, solve_joint
-from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
-from selfcal_ros.estimation.terms.sizes import DOUBT_LEVEL
+from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL, LEAST_NOISE_M, TermEquations
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,

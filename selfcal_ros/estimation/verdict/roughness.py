@@ -15,19 +15,18 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.joint.finer import (
+from selfcal_ros.estimation.joint.model_fit import (
+    ModelFit,
     equations_left,
     is_too_large,
     told_coefficients,
     with_map,
 )
-from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.lattice.placed import MapSpline
+from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
-from selfcal_ros.estimation.normal.equations import GAP, grid_residuals
-from selfcal_ros.estimation.normal.placed import PlacedEquations
+from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_residuals
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.plate_form import with_nodes

@@ -13,27 +13,24 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.joint.finer import finer
-from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.joint.solved import Solved
+from selfcal_ros.estimation.joint.model_fit import finer
+from selfcal_ros.estimation.joint.solve import Solved, solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
-from selfcal_ros.estimation.terms.sizes import SizeTest
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, SizeTest
 from selfcal_ros.estimation.verdict.causes import (
+    CAUSE_LEVEL,
+    READING,
     SURE,
+    Explanation,
     cause_of,
+    find_explanations,
     fitted_term,
     line_cause,
     noisier_views,
+    off_sites_cause,
     scatter_of_views,
     turned_too_far,
 )
-from selfcal_ros.estimation.verdict.explanations import (
-    CAUSE_LEVEL,
-    Explanation,
-    find_explanations,
-)
-from selfcal_ros.estimation.verdict.off_sites import READING, off_sites_cause
 from selfcal_ros.estimation.verdict.roughness import adequacy_of, line_adequacy_of, maps_to_try
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,

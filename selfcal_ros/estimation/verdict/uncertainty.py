@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
-from selfcal_ros.estimation.joint.solved import (
+from selfcal_ros.estimation.joint.solve import (
     ANGULAR_KEY,
     KEY,
     MAX_FULL,

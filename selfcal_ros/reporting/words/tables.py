@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.estimation.observability import plan_check
-from selfcal_ros.estimation.observability.plan_budget import PlanBudget, Removal
+from selfcal_ros.estimation.observability.resistance import PlanBudget, Removal
 from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget

@@ -11,8 +11,15 @@ from scipy.stats import binom, chi2
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.between import Run, _parts, mean_of, variance_between
-from selfcal_ros.estimation.comparison.combine import Part, _of_run, combine
+from selfcal_ros.estimation.comparison.combine import (
+    Part,
+    Run,
+    _of_run,
+    _parts,
+    combine,
+    mean_of,
+    variance_between,
+)
 from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength

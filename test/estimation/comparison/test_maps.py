@@ -12,7 +12,7 @@ from scipy.stats import binom, norm
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
-from selfcal_ros.estimation.normal import systems
+from selfcal_ros.estimation.normal import equations
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
 from test.support.options import bare
@@ -68,9 +68,9 @@ def test_a_map_against_itself():
 
 def test_maps_of_the_same_marks_share_their_equations_and_others_do_not(monkeypatch):
     made = []
-    monkeypatch.setattr(systems, "NormalEquations",
+    monkeypatch.setattr(equations, "NormalEquations",
                         lambda *given, **kw: made.append(given) or NormalEquations(*given, **kw))
-    systems.clear_cache()
+    equations.clear_cache()
     compare(A, B)
     assert len(made) == 1
     repeated = replace(B, views=tuple(replace(v, read_angular=2) for v in B.views))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import plate_covariance
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.comparison.together import plate_covariance
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes

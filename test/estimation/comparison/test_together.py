@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.together import together
+from selfcal_ros.estimation.comparison.covariance import together
 from selfcal_ros.estimation.joint import solve
-from selfcal_ros.estimation.joint.solved import KEY
-from selfcal_ros.estimation.terms import sizes
+from selfcal_ros.estimation.joint.solve import KEY
+from selfcal_ros.estimation.terms import equations
 from selfcal_ros.estimation.verdict import judge
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -23,7 +23,7 @@ from test.estimation.terms.test_dense_fit import both, measured
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests."""
     monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
-    monkeypatch.setattr(sizes, "DOUBT_LEVEL", sizes.SIZE_LEVEL)
+    monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.SIZE_LEVEL)
     monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
 

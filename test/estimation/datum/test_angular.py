@@ -8,11 +8,11 @@ import pytest
 from scipy.stats import chi2
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.datum import angular
-from selfcal_ros.estimation.datum.angular import conditions_for, misclosure_test
-from selfcal_ros.estimation.joint.fit import fit
+from selfcal_ros.estimation.datum import covariance as covers
+from selfcal_ros.estimation.datum.covariance import conditions_for, misclosure_test
+from selfcal_ros.estimation.joint.problem import fit
 from selfcal_ros.estimation.joint.solve import prepare
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -69,7 +69,7 @@ def test_variances_do_not_depend_on_how_many_lines_are_computed_at_once(monkeypa
     readings = simulate_measurements(random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng,
                                      sigma_m=1e-7, sigma_theta_rad=1e-5)
     whole = calibrate(readings).error_map.u_g_theta
-    monkeypatch.setattr(angular, "BLOCK", 5)  # of 12
+    monkeypatch.setattr(covers, "BLOCK", 5)  # of 12
     assert calibrate(readings).error_map.u_g_theta == pytest.approx(whole, rel=1e-12)
 
 

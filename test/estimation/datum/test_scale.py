@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.datum.covariance import scale_of, scale_rows
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of

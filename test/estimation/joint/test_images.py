@@ -15,7 +15,7 @@ from selfcal_ros.estimation.joint.camera import Distortion, straight_products
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
-from selfcal_ros.estimation.normal.systems import system_for
+from selfcal_ros.estimation.normal.equations import system_for
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm

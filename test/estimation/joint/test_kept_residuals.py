@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint import solved
+from selfcal_ros.estimation.joint import solve
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -102,7 +102,7 @@ def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
 @pytest.mark.parametrize("parts", [1, 8, 60, 200])
 def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkeypatch, parts):
     """Two visits a mark, in an order of their own, with unequal repeats: part by part."""
-    monkeypatch.setattr(solved, "MAX_PARTS", parts)
+    monkeypatch.setattr(solve, "MAX_PARTS", parts)
     rng, measurements = np.random.default_rng(2), measured(visits=True)
     views, about = [], []
     for view in measurements.views[:2]:
@@ -141,7 +141,7 @@ def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monke
     assert [e["view"] for e in again] == [e["view"] for e in own]
     assert again[3]["dx"] == [[None if np.isnan(v) else v for v in row]
                               for row in own[3]["dx"].tolist()]
-    monkeypatch.setattr(solved, "MAX_READINGS", 49 + 49 + 42 - 1)
+    monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42 - 1)
     assert "residuals" not in calibrate(measurements, BARE).extra
-    monkeypatch.setattr(solved, "MAX_READINGS", 49 + 49 + 42)
+    monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42)
     assert "residuals" in calibrate(measurements, BARE).extra

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
-from selfcal_ros.estimation.normal import equations, systems
+from selfcal_ros.estimation.normal import equations
 from selfcal_ros.estimation.observability.rank import plan_observability
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -32,9 +32,9 @@ def test_the_core_of_a_large_plan_tells_its_rank_alone(monkeypatch, names, missi
     plan = plan_of(names, Artifact(21, 0.005))
     small = plan_observability(plan)
     monkeypatch.setattr(equations, "CORE", 9)
-    systems.clear_cache()
+    equations.clear_cache()
     assert plan_observability(plan) == small
-    systems.clear_cache()
+    equations.clear_cache()
 
 
 def test_the_uncertainty_of_a_large_field_is_given_on_request(monkeypatch):
@@ -74,7 +74,7 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
 
 def test_the_number_of_threads_changes_no_bit(capsys):
     """Here with one thread and in a process with several."""
-    systems.clear_cache()
+    equations.clear_cache()
     with threadpool_limits(1):
         exec(SCRIPT, {})
     alone = capsys.readouterr().out

@@ -8,8 +8,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint import model_fit
-from selfcal_ros.estimation.joint.finer import fit_model
-from selfcal_ros.estimation.joint.model_fit import squares
+from selfcal_ros.estimation.joint.model_fit import fit_model, squares
 from selfcal_ros.estimation.joint.problem import own_rotations
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.normal.grid import GridSystem

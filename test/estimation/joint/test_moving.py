@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
-from selfcal_ros.estimation.joint import fit as fitting
+from selfcal_ros.estimation.joint import problem as fitting
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact

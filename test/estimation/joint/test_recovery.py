@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal import systems
+from selfcal_ros.estimation.normal import equations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -128,7 +128,7 @@ def test_order_of_readings_changes_no_bit(seed):
         shuffled.append(replace(view, **fields))
     other = replace(readings, views=tuple(shuffled))
     one, other = calibrate(readings, BARE), calibrate(other, BARE)
-    systems.clear_cache()
+    equations.clear_cache()
     again = calibrate(readings, BARE)
     for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta"):
         expected = getattr(one.error_map, name).tobytes()

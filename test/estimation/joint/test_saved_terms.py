@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.joint.solved import KEY, saved_terms
-from selfcal_ros.estimation.terms.columns import Column, TermColumns
-from selfcal_ros.estimation.terms.shapes import WithinMarks
+from selfcal_ros.estimation.joint.solve import KEY, saved_terms
+from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks
 from selfcal_ros.model.readings import Sense
 
 SIGMA = 3.0

@@ -10,7 +10,7 @@ import pytest
 from selfcal_ros.estimation.comparison.covariance import system_behind
 from selfcal_ros.estimation.joint.problem import grid_dof
 from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.rank import deficiency, unknowns_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.compensation.cells import bicubic_cells, bilinear_cells
-from selfcal_ros.estimation.lattice.maps import LatticeViews
-from selfcal_ros.estimation.lattice.placed import MapSpline, PlacedViews
+from selfcal_ros.estimation.lattice.maps import LatticeViews, MapSpline, PlacedViews
 from selfcal_ros.estimation.lattice.readings import pose_of
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.view import View

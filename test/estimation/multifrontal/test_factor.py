@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.multifrontal import dissection
+from selfcal_ros.estimation.multifrontal import factor
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.pose import LatticePose
 
@@ -47,11 +47,11 @@ def dense(grid):
 
 @pytest.mark.parametrize("shape", [(7, 7), (9, 5), (15, 11)])
 @pytest.mark.parametrize("poses", SETS)
-@pytest.mark.parametrize("leaf", [4, 12, dissection.LEAF])
+@pytest.mark.parametrize("leaf", [4, 12, factor.LEAF])
 def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
         poses, shape, leaf, monkeypatch):
     """With small leaves there are fronts on many levels, as on large fields."""
-    monkeypatch.setattr(dissection, "LEAF", leaf)
+    monkeypatch.setattr(factor, "LEAF", leaf)
     grid = grid_of(poses, shape, 3)
     if (leaf, poses, shape) == (4, SETS[0], (15, 11)):
         assert len(grid.factor.dissection.fronts) > 6

@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from selfcal_ros.estimation.observability.any_pose import (
+from selfcal_ros.estimation.observability.suggest import (
+    best_plan,
     best_pose,
     pose_of_view,
     posed,
+    rank_next,
     reach_of,
+    score_plan,
     start_poses,
 )
-from selfcal_ros.estimation.observability.suggest import best_plan, rank_next, score_plan
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View

@@ -7,8 +7,8 @@ from math import pi
 import numpy as np
 import pytest
 
+from selfcal_ros.estimation.observability.rank import equivalent_key
 from selfcal_ros.estimation.observability.suggest import score_plan
-from selfcal_ros.estimation.observability.unseen import equivalent_key
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View
 

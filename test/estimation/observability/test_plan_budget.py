@@ -7,9 +7,9 @@ from math import pi
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.observability import plan_budget as module
-from selfcal_ros.estimation.observability.plan_budget import NOISE, effects_of_terms, plan_budget
+from selfcal_ros.estimation.observability import resistance as module
 from selfcal_ros.estimation.observability.plan_check import check_stops, predict_plan
+from selfcal_ros.estimation.observability.resistance import NOISE, effects_of_terms, plan_budget
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import plan_check, rank
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
@@ -21,8 +21,12 @@ from selfcal_ros.estimation.observability.plan_check import (
     predict_plan,
     smaller,
 )
-from selfcal_ros.estimation.observability.rank import identifies, plan_observability
-from selfcal_ros.estimation.observability.unseen import is_unseen, unseen_modes
+from selfcal_ros.estimation.observability.rank import (
+    identifies,
+    is_unseen,
+    plan_observability,
+    unseen_modes,
+)
 from selfcal_ros.model.view import View
 from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of

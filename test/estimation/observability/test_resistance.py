@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms, nominal_sizes

@@ -9,14 +9,14 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import plan_check, suggest
 from selfcal_ros.estimation.observability.plan_check import (
     candidate_views,
     check_plan,
+    predict,
     predict_plan,
 )
-from selfcal_ros.estimation.observability.prediction import predict
 from selfcal_ros.estimation.observability.suggest import (
     Against,
     best_plan,

@@ -8,8 +8,8 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.systems import planned_system
-from selfcal_ros.estimation.observability.prediction import predict
+from selfcal_ros.estimation.normal.equations import planned_system
+from selfcal_ros.estimation.observability.plan_check import predict
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum

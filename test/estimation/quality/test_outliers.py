@@ -10,11 +10,11 @@ from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
-from selfcal_ros.estimation.quality import residuals
-from selfcal_ros.estimation.quality.outliers import clean
-from selfcal_ros.estimation.quality.residuals import (
+from selfcal_ros.estimation.quality import outliers
+from selfcal_ros.estimation.quality.outliers import (
     angular_redundancy,
     by_repeats,
+    clean,
     drawn_redundancy,
     exact_leverage,
     residuals_of,
@@ -94,7 +94,7 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
 def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkeypatch):
     _, readings = measured(missing=0.1)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(residuals, "EXACT_LINES", 0)
+    monkeypatch.setattr(outliers, "EXACT_LINES", 0)
     assert angular_redundancy(system).sum() == pytest.approx(
         system.angular.n_readings - system.rank_angular, rel=1e-9)
 
@@ -102,7 +102,7 @@ def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkey
 def test_drawn_and_exact_redundancies_agree(monkeypatch):
     _, readings = measured(missing=0.1, repeats=3)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(residuals, "N_DRAWS", 400)
+    monkeypatch.setattr(outliers, "N_DRAWS", 400)
     assert np.abs(drawn_redundancy(system) - exact_leverage(system)[0]).max() < 0.06
 
 
@@ -436,7 +436,7 @@ def test_finite_rotations_are_no_outliers_with_the_rigid_model():
 
 
 def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monkeypatch):
-    monkeypatch.setattr("selfcal_ros.estimation.quality.slip.AMBIGUOUS", 1e9)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.AMBIGUOUS", 1e9)
     truth, readings = measured(4, more=True)
     result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
     said = " ".join(worded(result).warnings)

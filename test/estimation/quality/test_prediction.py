@@ -8,8 +8,8 @@ import pytest
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
-from selfcal_ros.estimation.quality import prediction, validation
-from selfcal_ros.estimation.quality.prediction import HeldReadings, PredictionLimit, noise_of
+from selfcal_ros.estimation.quality import validation
+from selfcal_ros.estimation.quality.validation import HeldReadings, PredictionLimit, noise_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm
@@ -62,7 +62,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     Terms are free and each mark is visited once, so that no other draw has a part in it. A drift
     is of each view, a turned microscope common to all; only with that can a view be held out.
     """
-    monkeypatch.setattr(prediction, "DRAWS", 4)
+    monkeypatch.setattr(validation, "DRAWS", 4)
     plan = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
     rng = np.random.default_rng(8)
     readings = with_visits(simulate_measurements(random_truth(
@@ -71,11 +71,11 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     terms = [ModelTerm("microscope"), *[ModelTerm("drift")] * of_view]
     options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1,
                    at_places=False)
-    seen = []
+    seen, limit_of = [], validation.prediction_limit
 
     def judged(model: ModelFit, held: HeldReadings, known: np.ndarray,
                weight: np.ndarray) -> PredictionLimit:
-        limit = prediction.prediction_limit(model, held, known, weight)
+        limit = limit_of(model, held, known, weight)
         seen.append((model, held, known, weight, limit))
         return limit
     monkeypatch.setattr(validation, "prediction_limit", judged)

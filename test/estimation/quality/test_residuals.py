@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.quality import residuals
-from selfcal_ros.estimation.quality.residuals import residuals_of, view_noise
+from selfcal_ros.estimation.quality import outliers
+from selfcal_ros.estimation.quality.outliers import residuals_of, view_noise
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan, View
 from test.support.truth import random_truth, simulate_measurements
@@ -68,7 +68,7 @@ def test_the_noise_of_a_view_and_its_degrees_of_freedom(monkeypatch):
 
     A form y' A y of unit noise has the variance 2 tr(A A).
     """
-    monkeypatch.setattr(residuals, "VIEW_DRAWS", 1000)
+    monkeypatch.setattr(outliers, "VIEW_DRAWS", 1000)
     readings = measured()
     found = view_noise(residuals_of(readings, LINEAR))
     left, y, of_view = dense(readings)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from selfcal_ros.estimation.recheck.detection import POWER, TAIL, ChangeTests
+from selfcal_ros.estimation.recheck.change import POWER, TAIL, ChangeTests
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 

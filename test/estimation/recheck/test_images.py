@@ -10,13 +10,12 @@ from scipy.stats import binom
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.together import together
+from selfcal_ros.estimation.comparison.covariance import together
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.planned import predict_recheck
 from selfcal_ros.estimation.recheck.plate import known_plate
-from selfcal_ros.estimation.recheck.solve import recheck
+from selfcal_ros.estimation.recheck.solve import predict_recheck, recheck
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation.cell import CellSettings

@@ -20,9 +20,8 @@ from selfcal_ros.estimation.comparison.covariance import (
 )
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
-from selfcal_ros.estimation.recheck.planned import predict_recheck
 from selfcal_ros.estimation.recheck.plate import known_plate
-from selfcal_ros.estimation.recheck.solve import _misfit, recheck
+from selfcal_ros.estimation.recheck.solve import _misfit, predict_recheck, recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset

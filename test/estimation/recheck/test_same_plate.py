@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError
-from selfcal_ros.estimation.recheck import same_plate
+from selfcal_ros.estimation.recheck import plate as of_plate
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
@@ -105,9 +105,9 @@ def test_what_neighbours_do_not_share_is_found_beneath_a_smooth_field():
     z = (half[:, None] + 1j * half).ravel()
     smooth = 0.05 * (z.real**2 + 1j * z.real * z.imag)
     white = rng.normal(size=len(z)) + 1j * rng.normal(size=len(z))
-    assert same_plate._not_shared(z, smooth) < 0.1
-    assert same_plate._not_shared(z, smooth + white) == pytest.approx(1.0, abs=0.25)
-    assert same_plate._not_shared(z[::30], white[::30]) == 0.0
+    assert of_plate._not_shared(z, smooth) < 0.1
+    assert of_plate._not_shared(z, smooth + white) == pytest.approx(1.0, abs=0.25)
+    assert of_plate._not_shared(z[::30], white[::30]) == 0.0
 
 
 @pytest.mark.parametrize("size", [5e-7, 1e-5])

@@ -11,7 +11,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms import sizes
+from selfcal_ros.estimation.terms import equations
 from selfcal_ros.estimation.verdict import judge
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
@@ -66,7 +66,7 @@ PLANS = {
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests (test_axes.py, test_sizes.py)."""
     monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
-    monkeypatch.setattr(sizes, "DOUBT_LEVEL", sizes.SIZE_LEVEL)
+    monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.SIZE_LEVEL)
     monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
 

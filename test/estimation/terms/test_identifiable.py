@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.terms.sizes import unseen_by_term
+from selfcal_ros.estimation.terms.equations import unseen_by_term
 
 INF = float("inf")
 

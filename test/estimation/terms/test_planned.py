@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.normal.systems import planned_system
+from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.visit_order import visit_sequence

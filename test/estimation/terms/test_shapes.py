@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.terms.shapes import shapes_of
+from selfcal_ros.estimation.terms.columns import shapes_of
 
 VIEWS, LATTICE, MARKS = 3, (3, 5), 15
 OF_COLUMN, UNIT = [0, 0, 1, 2, 2, 3, 1], [1, 1j, 1j, 1, 1j, 1, 1]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.equations import Score, Sums
-from selfcal_ros.estimation.verdict.explanations import (
+from selfcal_ros.estimation.verdict.causes import (
     Candidates,
     Group,
     select_explanations,

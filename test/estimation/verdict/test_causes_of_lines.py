@@ -9,7 +9,7 @@ from scipy.stats import kstest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.estimation.joint.finer import fit_model
+from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact

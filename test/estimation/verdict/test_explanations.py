@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint.finer import fit_model
+from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.terms.columns import Column
-from selfcal_ros.estimation.verdict.explanations import _groups, find_explanations
+from selfcal_ros.estimation.verdict.causes import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade

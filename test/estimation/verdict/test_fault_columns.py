@@ -7,7 +7,7 @@ import pytest
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.columns import ColumnBuilder
 from selfcal_ros.estimation.terms.visits import ground_of
-from selfcal_ros.estimation.verdict.off_sites import slip_columns
+from selfcal_ros.estimation.verdict.causes import slip_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.lattice_plans import plan_of

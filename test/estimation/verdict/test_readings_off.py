@@ -10,7 +10,7 @@ from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import ColumnBuilder
-from selfcal_ros.estimation.verdict.off_sites import MOST, reading_columns
+from selfcal_ros.estimation.verdict.causes import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded

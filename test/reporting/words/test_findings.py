@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.terms.columns import Column
-from selfcal_ros.estimation.verdict.causes import cause_of
-from selfcal_ros.estimation.verdict.explanations import Explanation
+from selfcal_ros.estimation.verdict.causes import Explanation, cause_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Noise, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
