@@ -205,20 +205,22 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
         centre = place + moved[:, np.cumsum(visits.count) - visits.count]
         centre = -centre if settings.sense is Sense.PLATE_MOVES else centre
         stop = centre + physics.stage_error(truth, centre, index)
-    stop = stop + _normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
+    stop = stop + normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
     came = np.concatenate([lead_in(truth, stop[:, :1]), stop], axis=1)
     approach = np.stack([approach_signs(row, physics.NO_MOTION_M)[1:] for row in came])
-    position = stop[:, visit] + _normal(rng, settings.servo_sigma_m, (2, size))
-    lag = ((truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach[:, visit]
-           + physics.settling(truth, came, visit, settings.exposure_period_s))
-    stage = position - physics.stage_error(truth, position, index) - lag
+    position = stop[:, visit] + normal(rng, settings.servo_sigma_m, (2, size))
+    rested = np.arange(size) - np.searchsorted(visit, visit)
+    stage = physics.true_position(
+        truth, index, position, tau=tau, approach=approach[:, visit],
+        sign=physics.motion_sign(np.diff(came, axis=1))[:, visit],
+        rested_s=rested * settings.exposure_period_s)
     at = (truth, settings.sense, position, stage)
-    white = _white(rng, settings, size)
-    shared = (_normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
+    white = white_noise(rng, settings, size)
+    shared = (normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
               + _flicker(rng, settings.flicker_xy_m, (2, size))
-              + _normal(rng, settings.image_xy_m, (2, size)))
+              + normal(rng, settings.image_xy_m, (2, size)))
     told = physics.offset_seen(*at, place[:, visit] + moved) + white + shared
-    indicated = position + _normal(rng, settings.encoder_sigma_m, (2, size))
+    indicated = position + normal(rng, settings.encoder_sigma_m, (2, size))
     others = []
     for sub in view.sub_views:
         if sub.cell is not None and sub.cell != (0, 0):
@@ -226,15 +228,15 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
             away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
             beside = physics.offset_seen(*at, away[:, visit] + moved)
             others.append(Seen(sub.cell, quantised(
-                beside + _white(rng, settings, size) + shared, settings.resolution_xy_m),
+                beside + white_noise(rng, settings, size) + shared, settings.resolution_xy_m),
                 np.stack(marks[:2]), there & marks[2]))
     return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
                          np.stack([m, n]), there, approach, tuple(others))
 
 
-def _white(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
+def white_noise(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
     """Return the noise of single marks, (2, E), m."""
-    white = _normal(rng, settings.sigma_xy_m, (2, size))
+    white = normal(rng, settings.sigma_xy_m, (2, size))
     white *= np.array([[1.0], [settings.noise_ratio]])
     return white
 
@@ -251,17 +253,16 @@ def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSet
     k, target = line_targets(truth.artifact, view, settings.sense,
                              consecutive=settings.consecutive)
     n_stops = len(direction) if settings.consecutive else len(k)
-    stop = _normal(rng, settings.stop_sigma_theta_rad, n_stops)
+    stop = normal(rng, settings.stop_sigma_theta_rad, n_stops)
     stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
     if settings.follow_mark:
         centre = direction if settings.sense is Sense.MICROSCOPE_MOVES else -direction
         target = (centre + physics.encoder_error(truth, centre))[k]
-    position = target + stop + _normal(rng, settings.servo_sigma_theta_rad, len(k))
-    stage = position - physics.encoder_error(truth, position)
-    offset = physics.true_offset(settings.sense, direction[k], stage)
-    told = (truth.line_factor * offset + _normal(rng, settings.sigma_theta_rad, len(k))
+    position = target + stop + normal(rng, settings.servo_sigma_theta_rad, len(k))
+    offset = physics.line_offset(truth, settings.sense, direction[k], position)
+    told = (truth.line_factor * offset + normal(rng, settings.sigma_theta_rad, len(k))
             + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
-    indicated = position + _normal(rng, settings.encoder_sigma_theta_rad, len(k))
+    indicated = position + normal(rng, settings.encoder_sigma_theta_rad, len(k))
     return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
 
 
@@ -285,7 +286,8 @@ def _flicker(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> 
     return sigma * flicker_noise(rng, shape) if sigma and shape[-1] else 0.0
 
 
-def _normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int) -> np.ndarray:
+def normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int) -> np.ndarray:
+    """Return normally distributed numbers; 0 without a draw if `sigma` is."""
     return rng.normal(0, sigma, shape) if sigma else np.zeros(shape)
 
 

@@ -151,27 +151,33 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
     return moved
 
 
-def settling(truth: Truth, came: np.ndarray, visit: np.ndarray, period_s: float,
-             ) -> np.ndarray | float:
-    """Return the settling error of the axes at each exposure, (2, E), m.
+def motion_sign(step: np.ndarray) -> np.ndarray:
+    """Return the sign of steps of the axes, m; 0 for one that takes up no backlash."""
+    return np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
+
+
+def true_position(truth: Truth, index: int, position: np.ndarray, *, tau: np.ndarray,
+                  approach: np.ndarray, sign: np.ndarray, rested_s: np.ndarray) -> np.ndarray:
+    """Return the true position of the stage at exposures, (2, E), m.
 
     Parameters
     ----------
-    truth
-        The truth.
-    came : float array (2, V + 1)
-        Stops of the stage, beginning with the one before the first visit.
-    visit : int array (E,)
-        Index of the visit of each exposure.
-    period_s : float
-        Time from one exposure to the next.
+    truth, index
+        The truth, and the index of the view.
+    position : float array (2, E)
+        Indicated position, m.
+    tau : float array (E,)
+        Time, 0..1 of the view.
+    approach, sign : float arrays (2, E)
+        Sign of the last motion of each axis, and of its step to this visit, 0 without one.
+    rested_s : float array (E,)
+        Time since the first exposure of the visit.
     """
-    if not truth.settling_m:
-        return 0.0
-    step = np.diff(came, axis=1)
-    sign = np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
-    rested = np.arange(len(visit)) - np.searchsorted(visit, visit)
-    return truth.settling_m * sign[:, visit] * np.exp(-rested * period_s / truth.settling_time_s)
+    settling: np.ndarray | float = 0.0
+    if truth.settling_m:
+        settling = truth.settling_m * sign * np.exp(-rested_s / truth.settling_time_s)
+    lag = (truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach + settling
+    return position - stage_error(truth, position, index) - lag
 
 
 def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarray:
@@ -255,6 +261,12 @@ def offset_seen(truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndar
         Positions of the marks with the stage at 0, m.
     """
     return seen_offset(truth, with_yaw(truth, sense, position, true_offset(sense, place, stage)))
+
+
+def line_offset(truth: Truth, sense: Sense, direction: np.ndarray,
+                position: np.ndarray) -> np.ndarray:
+    """Return the true offsets of lines at `direction` with the stage at indicated angles, rad."""
+    return true_offset(sense, direction, position - encoder_error(truth, position))
 
 
 def with_yaw(truth: Truth, sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -219,25 +219,29 @@ class Simulation:
     seed: int
     spread: Spread
     settings: CellSettings
-    faults: Faults
-    start_ns: int
-    compression: str
+    faults: Faults = Faults()
+    start_ns: int = 0
+    compression: str = "zstd"
     noise_seed: int | None = None
     placed: tuple[View | None, ...] = ()
     camera: Camera | None = None
     correction: ErrorMap | None = None
     correction_times: float = 1.0
 
-    def run(self) -> tuple[Truth, list[tuple[int, Event | Exposure]], dict[str, int]]:
-        """Return the truth, the messages with their times of arrival, and the counts of faults."""
+    def draw(self, n_views: int) -> tuple[Truth, np.random.Generator]:
+        """Return the truth for a number of placings, and the source of noise and faults."""
         machine = rng = np.random.default_rng(self.seed)
         if self.noise_seed is not None:
             rng = np.random.default_rng(self.noise_seed)
-        truth = random_truth(self.plan.artifact, len(self.plan.views), machine, self.spread,
-                             placing=rng)
+        truth = random_truth(self.plan.artifact, n_views, machine, self.spread, placing=rng)
         truth = replace(truth, placed=self.placed)
         if self.correction is not None:
             truth = corrected(truth, self.correction, self.correction_times)
+        return truth, rng
+
+    def run(self) -> tuple[Truth, list[tuple[int, Event | Exposure]], dict[str, int]]:
+        """Return the truth, the messages with their times of arrival, and the counts of faults."""
+        truth, rng = self.draw(len(self.plan.views))
         settings = replace(self.settings, with_ids=True) if self.camera else self.settings
         made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
         events = list(exposures(truth, self.plan, self.camera, made, sense=settings.sense)
