@@ -24,6 +24,7 @@ from selfcal_ros.model.readings import (
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import VERIFY, View
+from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import NS_PER_S
 
 Fields = dict[str, Any]
@@ -35,6 +36,16 @@ def header(stamp_ns: int, frame_id: str) -> Fields:
     """Return the fields of a std_msgs/Header."""
     sec, nanosec = divmod(stamp_ns, NS_PER_S)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def event_fields(event: Command | Detection | EncoderSample,
+                 frame_id: str) -> tuple[str, Fields]:
+    """Return topic and fields of a message of a cell."""
+    if isinstance(event, Command):
+        return COMMAND_TOPIC, command(event, frame_id)
+    if isinstance(event, Detection):
+        return DETECTION_TOPIC, detection(event, frame_id)
+    return ENCODER_TOPIC, joint_state(event, frame_id)
 
 
 def joint_state(sample: EncoderSample, frame_id: str) -> Fields:

@@ -12,11 +12,9 @@ from selfcal_ros.bagio.images import COLUMNS
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection import inputs
-from selfcal_ros.collection.inputs import Command, Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.outputs import plain, write_json, write_text
-from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.physics import stage_error
 from selfcal_ros.simulation.rendering import Camera, Exposure
@@ -63,7 +61,7 @@ def _write(simulation: Simulation, path: Path,
             if isinstance(event, Exposure):
                 topic, fields = image_fields(event, simulation.camera or Camera(), rng)
             else:
-                topic, fields = event_fields(event, "stage")
+                topic, fields = from_model.event_fields(event, "stage")
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
@@ -116,15 +114,6 @@ def image_fields(exposure: Exposure, camera: Camera, rng: np.random.Generator,
     """Return topic and fields of a rendered image."""
     values = camera.image(exposure.offsets, rng, angles=exposure.angle)
     return IMAGE_TOPIC, from_model.image(values, camera.encoding, exposure.stamp_ns, "camera")
-
-
-def event_fields(event: Event, frame_id: str) -> tuple[str, from_model.Fields]:
-    """Return topic and fields of a simulated message."""
-    if isinstance(event, Command):
-        return topics.COMMAND_TOPIC, from_model.command(event, frame_id)
-    if isinstance(event, Detection):
-        return topics.DETECTION_TOPIC, from_model.detection(event, frame_id)
-    return topics.ENCODER_TOPIC, from_model.joint_state(event, frame_id)
 
 
 def write_truth(path: Path, truth: Truth, **more: object) -> None:

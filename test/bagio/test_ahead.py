@@ -9,11 +9,11 @@ import pytest
 from selfcal_ros.bagio.offline import Playlist, collect_bag
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.reception import Reception
-from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import cdr_of, events_of, small_plan

@@ -29,8 +29,8 @@ from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.topics import ENCODER_TOPIC, INPUT_TOPICS, qos_profile
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan

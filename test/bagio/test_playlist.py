@@ -11,7 +11,7 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import EncoderSample
 from selfcal_ros.messages import from_model
-from selfcal_ros.simulation.bag import event_fields
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.topics import IMAGE_TYPES, INPUT_TOPICS
 from test.support import bags
 from test.support.bags import Foreign

@@ -16,7 +16,8 @@ from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
-from selfcal_ros.simulation.bag import QOS, event_fields
+from selfcal_ros.messages.from_model import event_fields
+from selfcal_ros.simulation.bag import QOS
 from selfcal_ros.topics import qos_profile
 from test.support.sessions import decoded, events_of, small_plan
 

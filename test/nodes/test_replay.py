@@ -20,6 +20,7 @@ from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player
@@ -27,7 +28,6 @@ from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
-from selfcal_ros.simulation.bag import event_fields
 from test.support.bags import Foreign
 from test.support.mark_lists import listed_plan
 from test.support.plans import image_plan, placed_plan

@@ -13,13 +13,13 @@ from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.clock_steps import Step
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.model.result import with_input
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import take_up
 from selfcal_ros.sessions.rejections import PATIENCE_S
 from selfcal_ros.sessions.solving import SolvingSession, solve
-from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from selfcal_ros.topics import INPUT_TOPICS
 from test.support.collecting import detection_table, encoder_block

@@ -12,10 +12,10 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.names import Topic
-from selfcal_ros.simulation.bag import event_fields
 from selfcal_ros.simulation.cell import Event
 
 PATIENCE_S = 300.0

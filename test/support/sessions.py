@@ -14,10 +14,11 @@ from selfcal_ros.bagio.schemas import ChannelDecoder, typestore
 from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
+from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.model.plan_form import plan_to_dict
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan
-from selfcal_ros.simulation.bag import event_fields, write_simulation
+from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.spec import Faults, apply_faults, read_simulation
 from selfcal_ros.topics import INPUT_TOPICS
