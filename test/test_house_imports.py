@@ -96,7 +96,7 @@ def test_imports_in_functions_state_their_reason(path):
         assert "  # " in line, f"{dotted(path)}:{node.lineno}: say why it is not at the top"
 
 
-WITH_SCIPY = {"solver", "mark_detector", "cell_driver"}
+WITH_SCIPY = {"solver", "mark_detector"}
 """The nodes that always compute with it: half a second and 30 MB at each start of a process."""
 
 

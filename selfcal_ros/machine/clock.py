@@ -3,6 +3,8 @@
 
 import time
 
+from selfcal_ros.units import NS_PER_S
+
 
 class Clock:
     """The system's time, read once: later steps of the system's clock do not reach the stamps."""
@@ -17,3 +19,25 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         """Wait."""
         time.sleep(seconds)
+
+
+class SimulatedClock(Clock):
+    """A clock on which a wait takes no time; every look at it takes a microsecond.
+
+    Attributes
+    ----------
+    ns : int
+        Its time, ns since 1970.
+    """
+
+    def __init__(self, ns: int = 0) -> None:
+        self.ns = ns
+
+    def now_ns(self) -> int:
+        """Return the time, ns since 1970."""
+        self.ns += 1000
+        return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        """Let the time pass."""
+        self.ns += round(seconds * NS_PER_S)

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase, check_command
+from selfcal_ros.collection.inputs import Command, Phase, check_command
 from selfcal_ros.errors import SelfcalError
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again, Duty
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
 from selfcal_ros.machine.measuring import place_by_robot
-from selfcal_ros.machine.visiting import Visitor
+from selfcal_ros.machine.visiting import Event, Visitor
 
 IDLE_S = 0.05
 """Time between two readings of the position while nothing is to be done."""
@@ -46,7 +46,7 @@ class Driver:
         self._cell, self._machine, self._say = cell, machine, say
         self._clock = clock or Clock()
         self._visitor = Visitor(machine, cell, self._clock)
-        self.events: deque[EncoderSample | Detection] = deque()
+        self.events: deque[Event] = deque()
         self.problem = ""
         self._duty = Duty()
         self._idle_since_ns = 0

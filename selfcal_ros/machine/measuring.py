@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -32,8 +32,7 @@ from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.contradicting import LEAST_VISITS, Contradiction, contradiction
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Machine, MachineError, Placing
-from selfcal_ros.machine.visiting import Visitor, stops
-from selfcal_ros.messages import from_model
+from selfcal_ros.machine.visiting import Event, Visitor, message_of, stops
 from selfcal_ros.model.readings import (
     REPEAT_OUTLIER,
     GridVisits,
@@ -43,14 +42,11 @@ from selfcal_ros.model.readings import (
 from selfcal_ros.model.view import Plan
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
-    DETECTION_TOPIC,
-    ENCODER_TOPIC,
     INPUT_TOPICS,
     qos_profile,
 )
 from selfcal_ros.units import NS_PER_S, UM_PER_M
 
-FRAME = "stage"
 REVISITS = 3
 """Rounds of revisits without a mark more, after which a view cannot be completed."""
 TELL_NS = NS_PER_S // 2
@@ -253,18 +249,13 @@ class Run:
             self._run_id = self._run_id or str(self._stamp_ns)
             self._write(replace(command, stamp_ns=self._stamp_ns, run_id=self._run_id))
 
-    def _write(self, event: Command | EncoderSample | Detection) -> None:
+    def _write(self, event: Command | Event) -> None:
         """Save a message, then use it."""
         assert self._journal is not None
         topic, fields = message_of(event)
         self._journal.write(f"/{topic}", cdr_bytes(INPUT_TOPICS[topic], fields), event.stamp_ns)
         self._journal.flush()
-        if isinstance(event, Command):
-            self.collector.add_command(event)
-        elif isinstance(event, Detection):
-            self.collector.add_detection(event)
-        else:
-            self.collector.add_encoder(event)
+        _feed(self.collector, event)
 
     def _why(self, progress: ViewProgress) -> tuple[str, str]:
         """Return why marks of a view are not read, to be appended to a sentence, and a remedy."""
@@ -379,10 +370,7 @@ class Run:
         assert command is not None
         again.add_command(replace(command, view=replace(view, repeats=1)))
         for event in self.visitor.view(self.plan.artifact, view, Again(marks)):
-            if isinstance(event, Detection):
-                again.add_detection(event)
-            else:
-                again.add_encoder(event)
+            _feed(again, event)
         found = again.collect()[1][progress.view_index].readings
         shift = np.array([[x - before[m, n][0], y - before[m, n][1]] for m, n, x, y in zip(
             found.m.tolist(), found.n.tolist(), found.dx, found.dy, strict=True)
@@ -405,14 +393,13 @@ def collector_settings(cell: Cell) -> CollectorSettings:
     return CollectorSettings.checked({"measurement_sense": str(cell.sense)}, str(cell.path))
 
 
-def message_of(event: Command | EncoderSample | Detection,
-               frame_id: str = FRAME) -> tuple[str, dict[str, Any]]:
-    """Return topic and fields of a message of a cell."""
+def _feed(collector: Collector, event: Command | Event) -> None:
     if isinstance(event, Command):
-        return COMMAND_TOPIC, from_model.command(event, frame_id)
-    if isinstance(event, Detection):
-        return DETECTION_TOPIC, from_model.detection(event, frame_id)
-    return ENCODER_TOPIC, from_model.joint_state(event, frame_id)
+        collector.add_command(event)
+    elif isinstance(event, Detection):
+        collector.add_detection(event)
+    elif isinstance(event, EncoderSample):
+        collector.add_encoder(event)
 
 
 def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a machine sees: images or offsets into detections; images that cannot be trusted."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, Kind
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.interface import Image, MachineError, Offset
-from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture
+
+if TYPE_CHECKING:
+    from selfcal_ros.vision.exposures import ImageDetector  # for its name
 
 SATURATED = 0.5
 """Part of saturated pixels from which an image is refused."""
@@ -70,12 +74,14 @@ class Eye:
             return self._of_images().take_picture(picture, shown.stamp_ns or stamp_ns)
         return [_detection(offset, stamp_ns) for offset in shown]
 
-    def _of_images(self) -> ImageDetector:
+    def _of_images(self) -> "ImageDetector":
         if self._detector is None:
             if self._settings is None:
                 raise InputError(f"{self._where}: detector", "the machine returns images, and how "
                                  "marks are found in them is not stated",
                                  "give detector: {mark: disc, mark_size: ...}, in m")
+            from selfcal_ros.vision.exposures import ImageDetector  # scipy: for images alone
+
             self._detector = ImageDetector(self._settings, f"{self._where}: detector")
         return self._detector
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from selfcal_ros.collection.inputs import EncoderSample, Kind
+from selfcal_ros.collection.inputs import EncoderSample
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.machine.cell import Cell
@@ -182,7 +182,7 @@ class Trial:
 
     def _marks(self) -> np.ndarray:
         """Return offsets of the marks seen now, (k, 2): px with a camera, else m."""
-        found = [item for item in self._visitor.expose()[1] if item.kind == Kind.GRID]
+        found = self._visitor.marks()
         if not found:
             raise NoDataError("machine", "no mark is seen after a small move",
                               "begin with a mark near the middle of the image")

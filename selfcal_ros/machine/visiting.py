@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
 from selfcal_ros.errors import NoDataError, first_line
 from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
@@ -21,18 +21,18 @@ from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Image, Machine, MachineError, Offset
 from selfcal_ros.machine.seeing import Eye
+from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import line_targets, stage_targets, visit_sequence
+from selfcal_ros.topics import IMAGE_TOPICS
 from selfcal_ros.units import NS_PER_S, UM_PER_M
 
 Position = dict[str, float]
 """Axis -> position in the stage frame, m or rad."""
-POLL_S = 0.02
-"""Time between two readings of the position that show whether the stage rests."""
 TRACK_NS = 40_000_000
-"""Largest time between two positions that are published, below the collector's largest gap."""
+"""Largest time between two positions that are told, below the collector's largest gap."""
 TINY = 1e-15
 """Least tolerance, m or rad: one of 0 is allowed."""
 TRIES = 3
@@ -49,6 +49,18 @@ UNITS = {1e3: "mm for m", 1e6: "um for m", 1e-3: "m for mm", 1e-6: "m for um",
 ANGLE_UNITS = {math.degrees(1.0): "degrees for rad", math.radians(1.0): "rad for degrees",
                1e3: "mrad for rad"}
 """The same for theta."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An image in which somebody else finds the marks: grey values (h, w), middle of exposure."""
+
+    stamp_ns: int
+    pixels: np.ndarray
+
+
+Event = EncoderSample | Detection | Photo
+"""What a visit tells."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +83,7 @@ class Stop:
 
 
 def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None = None,
-          rng: np.random.Generator | None = None) -> list[Stop]:
+          consecutive: bool = False, rng: np.random.Generator | None = None) -> list[Stop]:
     """Return the stops of a view in their order, marks first.
 
     Parameters
@@ -82,6 +94,8 @@ def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None =
         What moves.
     again : Again, optional
         Only what is missing, once each; None = all.
+    consecutive : bool
+        All repeats of a mark or line one after another.
     rng : numpy.random.Generator, optional
         Needed by the order ``random``.
     """
@@ -89,7 +103,7 @@ def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None =
         view = replace(view, repeats=1, visit_order="")
         if not again.checks:
             view = replace(view, check_marks=0, check_offset_m=0.0)
-    visits = visit_sequence(artifact, view, rng=rng)
+    visits = visit_sequence(artifact, view, consecutive=consecutive, rng=rng)
     at = stage_targets(artifact, view, visits, sense) + visits.aside_m
     aside = visits.aside_m.any(axis=0)
     found = []
@@ -98,7 +112,7 @@ def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None =
             x, y = at[:, number].tolist()
             found.append(Stop({"x": x, "y": y}, Kind.GRID, int(visits.count[number])))
     if view.angular:
-        lines, theta = line_targets(artifact, view, sense)
+        lines, theta = line_targets(artifact, view, sense, consecutive=consecutive)
         for k, angle in zip(lines.tolist(), theta.tolist(), strict=True):
             if again is None or k in again.lines:
                 found.append(Stop({"theta": angle}, Kind.ANGULAR))
@@ -117,12 +131,22 @@ class Visitor:
         Stamps and waits.
     seed : int
         For the order ``random``.
+    step_ns : int
+        Largest time between two positions that are told, on the line between two readings; rest
+        is two readings that agree after half of it.
+    consecutive : bool
+        All repeats of a mark or line one after another.
+    detects : bool
+        Whether marks are found in images; if not, the images are told.
     """
 
     machine: Machine
     cell: Cell
     clock: Clock = field(default_factory=Clock)
     seed: int = 0
+    step_ns: int = TRACK_NS
+    consecutive: bool = False
+    detects: bool = True
 
     def __post_init__(self) -> None:
         """Begin without a position."""
@@ -130,6 +154,7 @@ class Visitor:
         self.eye = Eye(self.cell.detector, str(self.cell.path))
         self._rng = np.random.default_rng(self.seed)
         self._last: EncoderSample | None = None  # where it was left at rest
+        self._untold: list[EncoderSample] = []  # of moves
         self._has_moved = False
         self._told_ns = 0  # newest stamp of a position
         self.stopped = False
@@ -158,21 +183,21 @@ class Visitor:
                                    "use the emergency stop") from error
             raise
 
-    def show(self) -> Image | list[Offset]:
-        """Return what the machine sees now.
+    def show(self, kind: Kind = Kind.GRID) -> Image | list[Offset]:
+        """Return what the machine sees now; lines are seen by its own sensor, if it has a camera.
 
         Raises
         ------
         MachineError
             If it shows neither an image nor offsets, or no image after others.
         """
-        image = self._ask("image")
+        image = self._ask("image") if kind == Kind.GRID else None
         if isinstance(image, Image):
             return image
         if image is not None:
             raise MachineError(f"it returns {type(image).__name__}", "machine.image",
                                "return Image(pixels), or None without a camera")
-        if self.eye.newest is not None:
+        if kind == Kind.GRID and self.eye.newest is not None:
             raise MachineError("it returns no image any more", "machine.image",
                                "check the camera and its cable")
         offsets = self._ask("offsets")
@@ -193,7 +218,7 @@ class Visitor:
         """
         route = stops(artifact, view, self.cell.sense)
         self.require(route)
-        self._last = None  # a person may have moved it by hand
+        self._last, self._untold = None, []  # a person may have moved it by hand
         if not self._has_moved:
             self.first_move(marks=False, turns=view.angular)
             self._has_moved = True
@@ -202,8 +227,8 @@ class Visitor:
             self.first_move(marks=True)
 
     def view(self, artifact: Artifact, view: View, again: Again | None = None,
-             ) -> Iterator[EncoderSample | Detection]:
-        """Visit a view and yield positions and detections in the order of their stamps.
+             ) -> Iterator[Event]:
+        """Visit a view and yield positions, and detections or images, in the order of their stamps.
 
         Raises
         ------
@@ -212,14 +237,15 @@ class Visitor:
         NoDataError
             If nothing is seen at several stops one after another.
         """
-        route = stops(artifact, view, self.cell.sense, again=again, rng=self._rng)
+        route = stops(artifact, view, self.cell.sense, again=again, consecutive=self.consecutive,
+                      rng=self._rng)
         self.require(route)
         empty = 0
         for number, stop in enumerate(route):
             for _ in range(stop.exposures):
                 found = 0
                 for event in self._visit(stop, only_nearest=view.image is None):
-                    found += isinstance(event, Detection)
+                    found += not isinstance(event, EncoderSample)
                     yield event
                 empty = 0 if found else empty + 1
             if again is None and empty >= min(EMPTY_STOPS, len(route)):
@@ -278,7 +304,8 @@ class Visitor:
         MachineError
             If the target is beyond the limits, the position does not follow or does not rest.
         """
-        start = self._start()
+        last, left = self._last, self._left()
+        start = dict(zip(self.axes, left.positions, strict=True))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
             target = target | {"theta": self._within_limits(target["theta"] + turns * math.tau)}
@@ -292,14 +319,18 @@ class Visitor:
                                    for axis in self.axes))
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
-        return self._rest(start, goal, target)
+        at = self._rest(start, goal, target)
+        if last is None or left.stamp_ns - last.stamp_ns > self.step_ns:
+            self._untold.append(left)  # what was read at rest meanwhile may have been told
+        self._untold += self._track(left, at)
+        return at
 
-    def _start(self) -> Position:
+    def _left(self) -> EncoderSample:
         """Return where the stage rests; raise if it is not where it was left."""
         now = self.sample()
         if self._last is not None:
             self._check_left_alone(_difference(self._last, now))
-        return dict(zip(self.axes, now.positions, strict=True))
+        return now
 
     def _check_left_alone(self, moved: Position) -> None:
         """Raise if the position at rest has changed by more than the tolerance of arrival."""
@@ -332,7 +363,7 @@ class Visitor:
         deadline_ns = self.clock.now_ns() + round(settle.patience * NS_PER_S)
         before = self.sample()
         while True:
-            self.clock.sleep(POLL_S)
+            self.clock.sleep(self.step_ns / 2 / NS_PER_S)
             now = self.sample()
             moved = _difference(before, now)
             away = {axis: value - goal[axis]
@@ -380,8 +411,9 @@ class Visitor:
             f"{reason and ': '}{reason}", "machine", "check drives, limit switches and the unit of "
             "the positions, or raise settle: arrival")
 
-    def expose(self) -> tuple[EncoderSample, list[Detection], EncoderSample]:
-        """Expose at rest: the positions before and after, and what is seen, all marks.
+    def expose(self, kind: Kind = Kind.GRID) -> tuple[EncoderSample, list[Detection | Photo],
+                                                      EncoderSample]:
+        """Expose at rest: the positions before and after, and what is seen: all, or an image.
 
         Raises
         ------
@@ -390,16 +422,16 @@ class Visitor:
         """
         for _ in range(TRIES):
             before = self._last or self.sample()
-            if self.clock.now_ns() - before.stamp_ns > TRACK_NS:
+            if self.clock.now_ns() - before.stamp_ns > self.step_ns:
                 before = self.sample()
             began = self.clock.now_ns()
-            shown = self.show()
+            shown = self.show(kind)
             ended = self.clock.now_ns()
             after = self.sample()
             moved = _difference(before, after)
             self._last = after
             if self._rests(moved):
-                found = self.eye.detections(shown, (began + ended) // 2, before.positions)
+                found = self._found(shown, (began + ended) // 2, before.positions)
                 self._check_stamps(found, before, after)
                 return before, found, after
             self._check_axes(before, after)
@@ -408,25 +440,48 @@ class Visitor:
         raise MachineError(f"{axis} moved by {_shown(axis, moved[axis])} during {TRIES} exposures",
                            "machine", "wait longer: settle: time in CELL.yaml")
 
-    def _check_stamps(self, found: list[Detection], before: EncoderSample,
+    def _found(self, shown: Image | list[Offset], stamp_ns: int,
+               position: tuple[float, ...]) -> list[Detection | Photo]:
+        if isinstance(shown, Image) and not self.detects:
+            return [Photo(shown.stamp_ns or stamp_ns, np.asarray(shown.pixels))]
+        return [*self.eye.detections(shown, stamp_ns, position)]
+
+    def _check_stamps(self, found: list[Detection | Photo], before: EncoderSample,
                       after: EncoderSample) -> None:
-        for detection in found:
-            if not before.stamp_ns <= detection.stamp_ns <= after.stamp_ns:
-                late_s = (detection.stamp_ns - after.stamp_ns) / NS_PER_S
+        for item in found:
+            if not before.stamp_ns <= item.stamp_ns <= after.stamp_ns:
+                late_s = (item.stamp_ns - after.stamp_ns) / NS_PER_S
                 raise MachineError(f"the stamp of an exposure is {late_s:+.3g} s from the reading "
                                    "of the position after it", "machine",
                                    "stamp by this computer's clock, or give no stamp")
 
-    def _visit(self, stop: Stop, *, only_nearest: bool) -> Iterator[EncoderSample | Detection]:
-        last = self._last
+    def _visit(self, stop: Stop, *, only_nearest: bool) -> Iterator[Event]:
         at = self.go(stop.target)
-        yield from _track(last, at)
-        before, found, after = self.expose()
-        found = [item for item in found if item.kind == stop.kind]
+        told, self._untold = self._untold, []
+        yield from told
+        before, found, after = self.expose(stop.kind)
+        found = [item for item in found if isinstance(item, Photo) or item.kind == stop.kind]
         if only_nearest and stop.kind == Kind.GRID:
-            found = sorted(found, key=lambda item: math.hypot(item.offset_x, item.offset_y))[:1]
-        yield from _track(at, before)
-        yield from _around(before, found, after)
+            found = sorted(found, key=_from_axis)[:1]
+        yield from self._track(at, before)
+        events = [*self._track(before, after), *found]
+        yield from sorted(events, key=lambda event: event.stamp_ns)
+
+    def _track(self, before: EncoderSample, after: EncoderSample) -> Iterator[EncoderSample]:
+        """Yield the second of two positions, and before it others on the line between them.
+
+        The encoder of a machine that is asked for its position has no gap, and the direction of
+        its last motion is known.
+        """
+        count = (after.stamp_ns - before.stamp_ns - 1) // self.step_ns
+        for number in range(1, count + 1):
+            part = number / (count + 1)
+            stamp = before.stamp_ns + round(part * (after.stamp_ns - before.stamp_ns))
+            yield EncoderSample(stamp, after.names, tuple(
+                early + part * (late - early) for early, late in zip(
+                    before.positions, after.positions, strict=True)))
+        if before.stamp_ns < after.stamp_ns:
+            yield after
 
     def first_move(self, *, marks: bool, turns: bool = False, step_m: float = 0.0) -> None:
         """Make a small move along each axis and back; check that position and marks follow.
@@ -457,16 +512,18 @@ class Visitor:
             at_home = self.cell.to_machine(axis, home[axis])
             inward = length if at_home < (low + high) / 2 else -length
             sees = marks and axis != "theta"
-            seen = self._seen() if sees else []
+            seen = self.marks() if sees else []
             at = self.go({axis: home[axis] + inward})
             if sees:
                 moved = dict(zip(self.axes, at.positions, strict=True))[axis] - home[axis]
-                self._check_marks(axis, moved, seen, self._seen(), self._seen())
+                self._check_marks(axis, moved, seen, self.marks(), self.marks())
             if low <= at_home <= high:
                 self.go({axis: home[axis]})
 
-    def _seen(self) -> list[Detection]:
-        return [item for item in self.expose()[1] if item.kind == Kind.GRID]
+    def marks(self) -> list[Detection]:
+        """Expose at rest; return the marks that are seen; raises like `expose`."""
+        return [item for item in self.expose()[1]
+                if isinstance(item, Detection) and item.kind == Kind.GRID]
 
     def _check_marks(self, axis: str, step: float, first: list[Detection],
                      second: list[Detection], third: list[Detection]) -> None:
@@ -538,26 +595,15 @@ def _difference(before: EncoderSample, after: EncoderSample) -> Position:
         before.names, before.positions, after.positions, strict=True)}
 
 
-def _track(before: EncoderSample | None, after: EncoderSample) -> Iterator[EncoderSample]:
-    """Yield the second of two positions, and before it others on the line between them.
-
-    One every 40 ms: the encoder of a machine that is asked for its position has no gap, and the
-    direction of its last motion is known.
-    """
-    if before is not None and before.stamp_ns < after.stamp_ns:
-        count = (after.stamp_ns - before.stamp_ns) // TRACK_NS
-        for number in range(1, count + 1):
-            part = number / (count + 1)
-            stamp = before.stamp_ns + round(part * (after.stamp_ns - before.stamp_ns))
-            yield EncoderSample(stamp, after.names, tuple(
-                early + part * (late - early) for early, late in zip(
-                    before.positions, after.positions, strict=True)))
-    if before is None or before.stamp_ns < after.stamp_ns:
-        yield after
+def _from_axis(item: Detection | Photo) -> float:
+    return 0.0 if isinstance(item, Photo) else math.hypot(item.offset_x, item.offset_y)
 
 
-def _around(before: EncoderSample, found: list[Detection],
-            after: EncoderSample) -> Iterator[EncoderSample | Detection]:
-    """Yield the detections of an exposure among the positions before and after it."""
-    events: list[EncoderSample | Detection] = [*_track(before, after), *found]
-    yield from sorted(events, key=lambda event: event.stamp_ns)
+def message_of(event: Command | Event,
+               frame_id: str = "stage") -> tuple[str, from_model.Fields]:
+    """Return topic and fields of a message of a cell."""
+    if isinstance(event, Photo):
+        encoding = f"mono{8 * event.pixels.itemsize}"
+        return IMAGE_TOPICS["raw"], from_model.image(event.pixels, encoding, event.stamp_ns,
+                                                     "camera")
+    return from_model.event_fields(event, frame_id)

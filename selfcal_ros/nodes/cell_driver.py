@@ -4,24 +4,21 @@
 import sys
 from typing import Any
 
-from selfcal_ros.collection import inputs
 from selfcal_ros.collection.settings.nodes import DriverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
-from selfcal_ros.machine.measuring import message_of
 from selfcal_ros.messages import to_model
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
+from selfcal_ros.nodes.telling import CellNode
 from selfcal_ros.sessions.health import Diagnosis, Level
 
 TICK_S = 0.005
 """Time between two looks for what the machine has told."""
 
 
-class CellDriver(SelfcalNode[DriverSettings]):
+class CellDriver(CellNode[DriverSettings]):
     """Publish what the thread of the machine tells."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -30,9 +27,7 @@ class CellDriver(SelfcalNode[DriverSettings]):
             raise InputError("cell_driver: cell", "is not set", "name a CELL.yaml")
         cell = read_cell(self.settings.cell)
         self._driver = Driver(cell, open_machine(cell), lambda line: self.say(Level.ERROR, line))
-        self._encoder = self.publisher(names.ENCODER)
-        self._detection = self.publisher(names.DETECTIONS)
-        self._sent = {"encoder_sent": 0, "detection_sent": 0}
+        self.publish(images=False)
         self.subscribe(names.COMMAND, lambda message: self._driver.take_command(
             to_model.command(message)))
         self.subscribe(names.STATUS_AS_IT_COMES, self._driver.take_status)
@@ -40,20 +35,13 @@ class CellDriver(SelfcalNode[DriverSettings]):
 
     def _tell(self) -> None:
         while self._driver.events:
-            event = self._driver.events.popleft()
-            _, fields = message_of(event, self.settings.frame_id)
-            if isinstance(event, inputs.Detection):
-                self._sent["detection_sent"] += 1
-                self._detection.publish(fill(names.DETECTIONS.type(), fields))
-            else:
-                self._sent["encoder_sent"] += 1
-                self._encoder.publish(fill(names.ENCODER.type(), fields))
+            self.tell(self._driver.events.popleft())
 
     def diagnosis(self) -> Diagnosis:
         """Return what the machine does, or why it stands still."""
         if self._driver.problem:
-            return Diagnosis(Level.ERROR, self._driver.problem, self._sent)
-        return Diagnosis(Level.OK, "measuring" if self._driver.busy else "at rest", self._sent)
+            return Diagnosis(Level.ERROR, self._driver.problem, self.sent)
+        return Diagnosis(Level.OK, "measuring" if self._driver.busy else "at rest", self.sent)
 
     def close(self) -> None:
         """Stop the machine and release it."""

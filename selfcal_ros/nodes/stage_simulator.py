@@ -1,40 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""stage_simulator: a cell with known truth that follows view commands."""
+"""stage_simulator: a simulated machine that follows view commands, visited as every machine is.
 
+Its time is simulated, too: a visit is computed at once, and told when its stamps have come.
+"""
+
+import math
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from selfcal_ros.collection import inputs
+from selfcal_ros.collection.inputs import Command, EncoderSample, check_simulated
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
-from selfcal_ros.machine.duty import Duty
+from selfcal_ros.machine.cell import AXES, Cell, Settle
+from selfcal_ros.machine.clock import SimulatedClock
+from selfcal_ros.machine.duty import Again, Duty
+from selfcal_ros.machine.interface import Placing
+from selfcal_ros.machine.simulated import SimulatedMachine
+from selfcal_ros.machine.visiting import Event, Visitor
 from selfcal_ros.messages import to_model
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.base import SelfcalNode
-from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.running import run
+from selfcal_ros.nodes.telling import CellNode
 from selfcal_ros.sessions.health import Diagnosis, Level
-from selfcal_ros.simulation.bag import IMAGES, event_fields, image_fields, write_truth
-from selfcal_ros.simulation.cell import JOINTS, Event, view_events
-from selfcal_ros.simulation.machine import Truth, random_truth
-from selfcal_ros.simulation.rendering import Camera, Exposure, exposures
-from selfcal_ros.simulation.spec import camera_of, settings_of, spread_of
+from selfcal_ros.simulation.bag import write_truth
+from selfcal_ros.simulation.spec import Simulation, camera_of, settings_of, spread_of
+from selfcal_ros.units import NS_PER_S
 
 LEAD_NS = 20_000_000
 """Time between a MEASURE command, or its arrival if later, and the first encoder sample
 of its view: no message is stamped in the past."""
-IMAGES_KEPT = 100
-"""Images that wait for a slow detector."""
+IDLE_STEPS = 10
+"""Time between two encoder samples while nothing is measured, over that in a view."""
+ANYWHERE = (-math.inf, math.inf)
 
 
-class StageSimulator(SelfcalNode[SimulatorSettings]):
+class StageSimulator(CellNode[SimulatorSettings]):
     """Publish encoder samples at a set rate, and detections while a view is measured.
 
     With a camera it publishes images instead of grid detections.
@@ -43,34 +47,41 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(SimulatorSettings, **kwargs)
         given = self.settings
-        self._cell = settings_of(asdict(given) | {"sense": given.measurement_sense})
-        self._rng = np.random.default_rng(given.seed)
-        self._camera: Camera | None = None
-        spread = None
-        if given.camera:
-            self._camera, spread = camera_of(given.camera)
-        self._spread = spread_of(asdict(given), spread)
-        self._grain = np.random.default_rng((given.seed, IMAGES))
-        self._plan: Plan | None = read_plan(given.plan) if given.plan else None
-        self.truth: Truth | None = None
-        self._events: Iterator[Event | Exposure] = iter(())
-        self._next: Event | Exposure | None = None
-        self._idle_stamp = 0
+        self._settings = settings_of(asdict(given) | {"sense": given.measurement_sense})
+        camera, spread = camera_of(given.camera) if given.camera else (None, None)
+        self._camera, self._spread = camera, spread_of(asdict(given), spread)
+        self.publish(images=camera is not None)
+        self._time, self._step_ns = SimulatedClock(), round(NS_PER_S / given.encoder_rate)
+        self.machine: SimulatedMachine | None = None
+        self._visitor: Visitor | None = None
+        self._events: Iterator[Event] = iter(())
+        self._next: Event | None = None
         self._duty = Duty()
         self._free_ns = 0  # stamp from which it is idle
-        self._encoder = self.publisher(names.ENCODER)
-        self._detection = self.publisher(names.DETECTIONS)
-        self._sent = {"encoder_sent": 0, "detection_sent": 0}
-        if self._camera is not None:
-            self._image = self.publisher(names.image_topics("raw", IMAGES_KEPT)[0])
-            self._sent["image_sent"] = 0
+        if given.plan:
+            self._prepare(read_plan(given.plan))
         self.subscribe(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS_AS_IT_COMES, self._on_status)
         self.every(0.005, self._on_timer)
 
+    def _prepare(self, plan: Plan) -> None:
+        """Draw a machine with the plate of a plan, and a placing for each of its views."""
+        given = self.settings
+        self.machine = SimulatedMachine.of(Simulation(
+            plan, given.seed, self._spread, self._settings, camera=self._camera), self._time)
+        cell = Cell(Path("stage_simulator"), "simulated", {}, dict.fromkeys(AXES, ANYWHERE),
+                    sense=self._settings.sense, settle=Settle(arrival=math.inf,
+                                                              arrival_theta=math.inf))
+        self._visitor = Visitor(
+            self.machine, cell, self._time, given.seed, consecutive=given.consecutive,
+            step_ns=self._step_ns, detects=self._camera is None)
+        if given.truth_path:
+            write_truth(Path(given.truth_path), self.machine.truth, seed=given.seed,
+                        cell=asdict(self._settings))
+
     def diagnosis(self) -> Diagnosis:
         """Return its activity and the number of messages sent."""
-        return Diagnosis(Level.OK, "at home" if self._next is None else "measuring", self._sent)
+        return Diagnosis(Level.OK, "at rest" if self._next is None else "measuring", self.sent)
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)
@@ -78,90 +89,44 @@ class StageSimulator(SelfcalNode[SimulatorSettings]):
             return
         self._next, self._events = None, iter(())
         if self._duty.command is not None:
-            self._measure(command)
+            self._measure(command, None)
 
     def _on_status(self, message: Any) -> None:
-        """Measure missing marks again after all have been measured."""
-        command = self._duty.command
-        if command is None or self._next is not None:
+        """Visit again what is missing, once all has been visited."""
+        if self._next is not None:
             return
-        again = self._duty.missing(message, self.get_clock().now().nanoseconds, self._free_ns)
-        view = replace(command.placed(), repeats=1)
-        if again.checks:  # check stops, and all marks once more
-            self._measure(replace(command, view=view))
-        elif again:
-            self._measure(replace(command, view=replace(view, check_marks=0, check_offset_m=0.0)),
-                          {*again.marks, *again.lines})
+        now_ns = self.get_clock().now().nanoseconds
+        again = self._duty.missing(message, now_ns, self._free_ns)
+        if again and self._duty.command is not None:
+            self._measure(self._duty.command, again)
 
-    def _measure(self, command: inputs.Command, missing: Collection[object] = ()) -> None:
-        """Measure the commanded view, of its marks those that are `missing`, if any."""
-        inputs.check_simulated(command)
-        plan = self._plan_with(command)
-        if self.truth is None or self.truth.artifact != plan.artifact:
-            count = max(64, len(plan.views), command.views_planned)
-            self.truth = random_truth(plan.artifact, count, np.random.default_rng(
-                self.settings.seed), self._spread)
-            if self.settings.truth_path:
-                write_truth(Path(self.settings.truth_path), self.truth, seed=self.settings.seed,
-                            cell=asdict(self._cell))
+    def _measure(self, command: Command, again: Again | None) -> None:
+        """Visit the commanded view, or what is missing of it."""
+        check_simulated(command)
+        view, plate, index = command.placed(), command.plate(), command.view_index
+        if self.machine is None or self.machine.truth.artifact != plate or (
+                index >= len(self.machine.truth.phi_rad)):
+            n_views = max(command.views_planned, index + 1)
+            self._prepare(Plan(command.plan_id, plate, (view,) * n_views))
+        assert self.machine is not None and self._visitor is not None
+        if again is None:
+            self.machine.place(Placing(view.name, *view.translation_m, view.rotation_rad, command))
         start_ns = max(command.stamp_ns, self.get_clock().now().nanoseconds) + LEAD_NS
-        cell = replace(self._cell, with_ids=self._cell.with_ids or self._camera is not None)
-        events = (event for event in view_events(
-            self.truth, plan, command.view_index, settings=cell, rng=self._rng, start_ns=start_ns)
-            if not missing or not isinstance(event, inputs.Detection)
-            or not event.has_id  # unknown which one: all of them
-            or (event.k if event.kind else (event.m, event.n)) in missing)
-        self._events = events if self._camera is None else self._exposed(command, plan, events)
+        self._time.ns = max(self._time.ns, start_ns)
+        order = view.visit_order or self.settings.visit_order
+        self._events = self._visitor.view(plate, replace(view, visit_order=order), again)
         self._next = next(self._events, None)
 
-    def _exposed(self, command: inputs.Command, plan: Plan,
-                 events: Iterator[Event]) -> Iterator[Event | Exposure]:
-        """Return the events of a view with images instead of grid detections."""
-        assert self.truth is not None and self._camera is not None
-        exposed = exposures(self.truth, plan, self._camera, chain(
-            [replace(command, view=command.placed())], events), sense=self._cell.sense)
-        next(exposed)  # the command itself
-        return exposed
-
-    def _plan_with(self, command: inputs.Command) -> Plan:
-        """Return the plan with the commanded view inserted; commands describe themselves."""
-        known = self._plan.views if self._plan else ()
-        count = max(len(known), command.view_index + 1)
-        views = [known[i] if i < len(known) else View(f"view {i}") for i in range(count)]
-        views[command.view_index] = command.placed()
-        self._plan = Plan(command.plan_id, command.plate(), tuple(views))
-        return self._plan
-
     def _on_timer(self) -> None:
-        now = self.get_clock().now().nanoseconds
-        while self._next is not None and self._next.stamp_ns <= now:
-            self._publish(self._next)
-            self._next = next(self._events, None)
-            self._free_ns = now
-        if self._next is None:
-            self._idle(now)
-
-    def _idle(self, now_ns: int) -> None:
-        """Keep the encoder alive between views, at a tenth of the rate, the stage at home."""
-        step = round(1e10 / self.settings.encoder_rate)
-        if now_ns - self._idle_stamp >= step:
-            self._idle_stamp = now_ns
-            self._publish(inputs.EncoderSample(now_ns, JOINTS, (0.0, 0.0, 0.0)))
-
-    def _publish(self, event: Event | Exposure) -> None:
-        if isinstance(event, Exposure):
-            assert self._camera is not None
-            _, fields = image_fields(event, self._camera, self._grain)
-            self._sent["image_sent"] += 1
-            self._image.publish(fill(names.IMAGE_TYPES["raw"](), fields))
-            return
-        _, fields = event_fields(event, self.settings.frame_id)
-        is_detection = isinstance(event, inputs.Detection)
-        self._sent["detection_sent" if is_detection else "encoder_sent"] += 1
-        if is_detection:
-            self._detection.publish(fill(names.DETECTIONS.type(), fields))
-        else:
-            self._encoder.publish(fill(names.ENCODER.type(), fields))
+        now_ns = self.get_clock().now().nanoseconds
+        while self._next is not None and self._next.stamp_ns <= now_ns:
+            event, self._next = self._next, None  # whatever is raised now, it is told once
+            self.tell(event)
+            self._next, self._free_ns = next(self._events, None), now_ns
+        if self._next is None and now_ns - self._time.ns >= IDLE_STEPS * self._step_ns:
+            self._time.ns = now_ns
+            self.tell(self._visitor.sample() if self._visitor else EncoderSample(
+                now_ns, AXES, (0.0, 0.0, 0.0)))
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,6 +12,7 @@ from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
+from selfcal_ros.machine.duty import PATIENCE_NS
 from selfcal_ros.machine.measuring import Run
 from test.support.cells import START_NS, Agreeing, Jumping, write_cell
 from test.support.waiting import wait_until
@@ -51,6 +53,24 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
     command(Phase.MEASURE)
     seen = {(event.m, event.n) for event in driver.events if isinstance(event, Detection)}
     assert len(seen) == 9
+
+
+def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
+    """The positions on the way to it begin where the stage has stood meanwhile."""
+    driver, _, _, command = cell
+    command(Phase.PLACE)
+    command(Phase.MEASURE)
+    told = len(driver.events)
+    wait_until(lambda: len(driver.events) >= told + 3, "positions at rest")
+    driver._clock.ns += 10 * PATIENCE_NS
+    wait_until(lambda: driver.events[-1].stamp_ns > driver._clock.ns - PATIENCE_NS, "a later one")
+    driver.take_status(SimpleNamespace(complete=False, view_index=0, run_id="", missing_m=[1],
+                                       missing_n=[0], missing_k=[], check_done=0, check_expected=0))
+    wait_until(lambda: not driver.busy, "the visit")
+    again = list(driver.events)[told:]
+    assert [(event.m, event.n) for event in again if isinstance(event, Detection)] == [(1, 0)]
+    stamps = [event.stamp_ns for event in driver.events]
+    assert stamps == sorted(stamps)
 
 
 def exposures(events) -> list[tuple]:

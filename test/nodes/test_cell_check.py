@@ -50,8 +50,8 @@ class FaultyCell(StageSimulator):
         now = self.get_clock().now().nanoseconds
         if now:
             super()._on_timer()
-        elif not (self._encoder.get_subscription_count()
-                  and self._detection.get_subscription_count()):
+        elif not all(self.count_subscribers(topic.name)
+                     for topic in (names.ENCODER, names.DETECTIONS)):
             return  # time begins when somebody listens
         second, nanosecond = divmod(now + STEP_NS if now else time.time_ns(), SECOND)
         self._clock_voice.publish(Clock(clock=Time(sec=second, nanosec=nanosecond)))
@@ -70,13 +70,13 @@ class FaultyCell(StageSimulator):
         if self.fault != "never revisits":
             super()._on_status(message)
 
-    def _measure(self, command, missing=()):
+    def _measure(self, command, again):
         if self.fault == "no check stops":
             command = replace(command, view=replace(
                 command.view, check_marks=0, check_offset_m=0.0))
-        super()._measure(command, missing)
+        super()._measure(command, again)
 
-    def _publish(self, event):
+    def tell(self, event):
         is_detection = isinstance(event, Detection)
         self.number += is_detection
         if self.fault == "loses" and is_detection and self.number % 7 == 0:
@@ -91,7 +91,7 @@ class FaultyCell(StageSimulator):
             event = replace(event, offset_x=seen.real, offset_y=seen.imag)
         if self.fault == "wrong ids" and is_detection and event.kind == 0:
             event = replace(event, m=event.n, n=event.m)
-        super()._publish(replace(event, stamp_ns=event.stamp_ns + shift))
+        super().tell(replace(event, stamp_ns=event.stamp_ns + shift))
 
 
 class Checker(CellChecker):

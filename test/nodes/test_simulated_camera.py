@@ -47,7 +47,7 @@ def test_the_shipped_camera_cell_is_calibrated_live_as_offline(graph, tmp_path):
     session = collect_bag(tmp_path / "bag", CollectorSettings.checked({}, "test"))
     offline = calibrate(session.measurements).error_map
     np.testing.assert_array_equal(live, [offline.gx.ravel(), offline.gy.ravel()])
-    true = cell.truth.g.reshape(2, -1)
+    true = cell.machine.truth.g.reshape(2, -1)
     sites, one, zero = offline.artifact.field, np.ones(25), np.zeros(25)
     x, y = sites.x_m.ravel(), sites.y_m.ravel()
     # the datum takes out origin, turn and scale

@@ -2,6 +2,7 @@
 """Cells for tests: a clock without waiting, a person who agrees, a plate under a controller."""
 
 from selfcal_ros.machine.cell import open_machine, read_cell
+from selfcal_ros.machine.clock import SimulatedClock
 from selfcal_ros.machine.gcode import GcodeMachine
 
 START_NS = 1_700_000_000_000_000_000
@@ -46,18 +47,11 @@ settle: {patience: 1.0}
 """
 
 
-class Jumping:
-    """A clock on which a wait takes no time; every look at it takes a microsecond."""
+class Jumping(SimulatedClock):
+    """A clock on which a wait takes no time, from `START_NS`."""
 
-    def __init__(self, start_ns: int = START_NS) -> None:
-        self.ns = start_ns
-
-    def now_ns(self) -> int:
-        self.ns += 1000
-        return self.ns
-
-    def sleep(self, seconds: float) -> None:
-        self.ns += round(seconds * 1e9)
+    def __init__(self, ns: int = START_NS) -> None:
+        super().__init__(ns)
 
 
 class Agreeing:
