@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import (
     BagLines,
     BagSession,
@@ -93,42 +94,57 @@ def run(args: argparse.Namespace) -> int:
         for line in (*bag.lost, *bag.clock):
             if line not in unplayed:
                 print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
-        if not saved.exists():
+        if saved.exists():
+            data = with_bag(read_json(saved), bag, unplayed, source)
+            if file_of(args):
+                write_json(args.output, data)
+            if on_stdout(args):
+                put(data)
+        _refuse_fault(args, code, detector, folder)
+        if code or not saved.exists():  # perhaps a result without a map
             return code or 1
-        data = with_bag(read_json(saved), bag, unplayed, source)
-    if file_of(args):
-        write_json(args.output, data)
-    if on_stdout(args):
-        put(data)
-    if code:  # a result without a map
-        _refuse_fault(args, code, detector)
-        return code
     result = result_from_dict(data, args.bag)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
 
 
-def offline(args: argparse.Namespace) -> BagSession:
-    """Return what `selfcal solve` collects from the bag."""
-    return collect_bag(args.bag, node_settings(args.params, CollectorSettings),
+def offline(args: argparse.Namespace, bag: str | Path) -> BagSession:
+    """Return what `selfcal solve` collects from a bag."""
+    return collect_bag(bag, node_settings(args.params, CollectorSettings),
                        namespace=args.namespace)
 
 
-def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSettings | None) -> None:
+def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSettings | None,
+                  folder: Path) -> None:
     """Refuse a plan that is not identified because of a fault of the cell, as `solve` does.
 
     Raises
     ------
     InputError
         With the fault, such as a plate that lies otherwise than planned.
+    NoDataError
+        With what images show instead of marks.
     """
-    if code != ExitCode.NOT_IDENTIFIABLE or detector is not None:
-        return
-    session = offline(args)
-    for fault in session.findings:
-        if fault not in session.lost:
-            raise InputError(args.bag, fault, "correct this first")
+    bag: str | Path = args.bag
+    if detector is not None and code in (ExitCode.NO_DATA, ExitCode.NOT_IDENTIFIABLE):
+        bag = _detected(args, detector, folder)
+    if code == ExitCode.NOT_IDENTIFIABLE:
+        session = offline(args, bag)
+        for fault in session.findings:
+            if fault not in session.lost:
+                raise InputError(args.bag, fault, "correct this first")
+
+
+def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path) -> Path:
+    """Return the bag of marks that `selfcal detect` finds in the images of a bag."""
+    from selfcal_ros.vision.exposures import ImageDetector  # with scipy, for images only
+
+    detector, found = ImageDetector(settings, args.bag), folder / "detected"
+    ImageBag(Path(args.bag), args.namespace).write_detected(
+        found, detector.take, check=lambda: detector.refuse_nothing(args.bag),
+        frame_id=settings.frame_id)
+    return found
 
 
 def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
@@ -146,7 +162,7 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
     transport = playlist.transport
     if not transport:
         if not playlist.counts.keys() >= INPUT_TOPICS.keys():
-            offline(args)  # raises what is missing
+            offline(args, args.bag)  # raises what is missing
         for name in (name for name, value in options.items() if value is not None):
             raise InputError(f"--{name.replace('_', '-')}", f"no images of {args.bag} are played",
                              "leave it out; it is for bags with images and no detections")

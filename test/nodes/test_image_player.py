@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
 
-from selfcal_ros.bagio.offline import Playlist, collect_bag
+from selfcal_ros.bagio.offline import BagSession, Playlist, collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main
@@ -25,6 +25,8 @@ from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import WAITING_IMAGES
 from selfcal_ros.nodes.solver import Solver
 from test.cli.test_detect import compressed, rewritten
+from test.support.sessions import small_bag, small_plan
+from test.support.verbs import simulate
 
 BAG = Path(__file__).parents[2] / "bags/camera"
 DETECTS = {"pixel_size": 6e-6, "mark_size": 7.2e-5, "turn": 1.5}
@@ -192,3 +194,36 @@ def test_no_image_is_played_before_the_detections_are_heard(graph, monkeypatch):
     assert player.player.played == 0
     connected.append(True)
     graph.until(lambda: player.player.played > 0, "the first message")
+
+
+@pytest.mark.parametrize(("mark", "ends", "fault", "code", "line"), [
+    ("5e-5", 3, "", 3, ""),
+    ("5e-5", 3, "view 'b': the plate lies otherwise", 2, "view 'b': the plate lies otherwise"),
+    ("5e-4", 4, "", 4, "no dark disc of 250 px was found; what repeats is 25 px")])
+def test_the_code_of_images_is_that_of_detect_and_solve(
+        monkeypatch, tmp_path, capsys, mark, ends, fault, code, line):
+    """The nodes find a plan not identified, or no mark; what the images show tells why."""
+    simulate(tmp_path, "images", {
+        "plan_id": "p", "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 0},
+        "views": [{"name": "a", "repeats": 1}, {"name": "b", "rotation_deg": 90, "repeats": 1}]},
+        camera={}, truth={"g": 2e-7, "a": 2e-7, "t": 1e-6, "phi": 1e-5})
+    unidentified = tmp_path / "unidentified.json"
+    assert main(["solve", str(small_bag(tmp_path, small_plan("0, 90"))), "--quiet", "-o",
+                 str(unidentified)]) == 3
+    capsys.readouterr()
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        if module.endswith("replay_session") and ends == 3:
+            Path(given[3]).write_bytes(unidentified.read_bytes())
+        yield SimpleNamespace(stdout=[], wait=lambda: ends)
+
+    def collected(bag, *_, **__):
+        assert Playlist(Path(bag)).counts["stage/mark_detections"] >= 18
+        return BagSession(None, {}, [], [fault] if fault else [])
+    monkeypatch.setattr(replay_verb, "process", process)
+    monkeypatch.setattr(replay_verb, "collect_bag", collected)
+    assert main(["replay", str(tmp_path / "images"), "--fast", "--pixel-size", "2e-6",
+                 "--mark-size", mark]) == code
+    said = capsys.readouterr().err
+    assert line in said and said.count("\n") == bool(line)
