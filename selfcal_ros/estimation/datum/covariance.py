@@ -298,8 +298,7 @@ class MapsCovariance:
     def _free(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return functionals (sites, k), (marks, k) of maps without scale as those of free maps."""
         system = self.system
-        a, g = (rows - basis @ np.real(basis.conj().T @ rows) for rows, basis in (
-            (a, system.plate_gauge.orthonormal), (g, system.gauge.orthonormal)))
+        a, g = system.plate_gauge.without(a), system.gauge.without(g)
         # what the datum takes off the stage as its scale, the plate has
         grown = np.real(system.grid.views.z.reshape(-1).conj() @ a)
         return g + np.outer(system.gauge.dual(3).reshape(-1), grown), a
@@ -313,7 +312,7 @@ class MapsCovariance:
         system, views = self.system, self.system.grid.views
         if plate:
             z, basis = views.z.reshape(-1), system.plate_gauge.orthonormal
-            fields = np.column_stack([-basis, z - basis @ np.real(basis.conj().T @ z)])
+            fields = np.column_stack([-basis, system.plate_gauge.without(z)])
             g = np.column_stack([np.zeros((views.z_sites.size, basis.shape[1])),
                                  system.gauge.dual(3).reshape(-1)])
             a = np.column_stack([basis, np.zeros(len(z))])

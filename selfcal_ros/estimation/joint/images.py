@@ -124,8 +124,7 @@ class ImageNoise:
     @property
     def marks(self) -> float:
         """Number of marks of an image, as a mean over its marks."""
-        count = np.bincount(self.stop)
-        return float((count**2).sum() / count.sum())
+        return marks_of_image(self.stop)
 
     def sums(self, residual: np.ndarray) -> np.ndarray:
         """Return the sum of squares of residuals (views, nx, ny), and that of images' sums, m^2."""
@@ -174,6 +173,12 @@ class ImageNoise:
         together = np.zeros((len(rest), int(self.stop.max()) + 1), dtype=complex)
         np.add.at(together.T, self.stop, one.T)
         return one, together
+
+
+def marks_of_image(stop: np.ndarray) -> float:
+    """Return the number of marks of an image, as a mean over the marks with these stops, (n,)."""
+    count = np.bincount(stop)
+    return float((count**2).sum() / count.sum())
 
 
 def _dof_of(draws: np.ndarray) -> float:
@@ -277,7 +282,5 @@ def _solved(system: NormalEquations,
     moved[:len(alone)] = alone
     moved -= system.gauge.parts(field) @ system.rigid[:4]
     moved -= system.plate_gauge.parts(plate) @ system.rigid[4:]
-    flat = np.where(system.known_sites, field, 0).reshape(-1)
-    basis = system.gauge.orthonormal
-    in_datum = flat - basis @ np.real(basis.conj().T @ flat)
+    in_datum = system.gauge.without(np.where(system.known_sites, field, 0).reshape(-1))
     return residual, moved[:len(alone)], float((abs(in_datum)**2).sum())

@@ -280,20 +280,6 @@ class AngularPart:
     noise: NoiseEstimate
 
 
-@dataclass(frozen=True, eq=False)
-class FreeNetworkSolution:
-    """A solution in no particular datum; `xy` is None where it is yet to be taken from it.
-
-    `ratio` is the weight of an angular reading against a grid reading, 0 without angular ones.
-    """
-
-    field: np.ndarray
-    parameters: np.ndarray
-    xy: NoiseEstimate | None
-    inverse: np.ndarray
-    ratio: float = 0.0
-
-
 def repeats_of(measurements: Measurements
                ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
@@ -348,9 +334,13 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
         return 1.0
     sigma_xy = max(sigma_xy, LEAST_NOISE_M, ROUNDING * float(np.abs(y).max()))
     peak = float(np.abs(problem.angular.y).max())
-    sigma_theta = max(sigma_theta, LEAST_NOISE_RAD, ROUNDING * peak,
-                      LEAST_PART * sigma_xy / problem.half_width_m)
+    sigma_theta = max(sigma_theta, ROUNDING * peak, least_noise_rad(problem, sigma_xy))
     return bounded_ratio(problem.system, sigma_xy, sigma_theta, problem.half_width_m)
+
+
+def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
+    """Return the noise of lines that counts at least beside such a noise of marks, rad."""
+    return max(LEAST_NOISE_RAD, LEAST_PART * sigma_xy / problem.half_width_m)
 
 
 def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
@@ -514,8 +504,19 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     system, grid, angular = problem.system, problem.system.grid, problem.system.angular
     n, length = 3 * grid.n_views, problem.half_width_m
     theta = theta or angular_part(problem)
-    raw = _solve_free(problem, y, theta)
-    field, parameters = raw.field, raw.parameters
+    free, d = grid.reduced(y)
+    xy, inverse, ratio = None, system.grid_inverse, 0.0
+    parameters = inverse @ d
+    field = (free - grid.response @ parameters).reshape(grid.views.shape)
+    if system.angular.n_views:
+        xy = grid_noise(problem, grid.plate(y, field, parameters)[1])
+        ratio = weight_ratio(problem, xy.sigma, theta.noise.sigma, y)
+        right = np.zeros(system.size)
+        right[:n] = d
+        right[system.phi_at] += ratio * length * theta.d
+        inverse = system.inverse(ratio)
+        parameters = inverse @ right
+        field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
 
     parts = system.gauge.parts(field)
     field = system.gauge.remove(field, parts)
@@ -534,7 +535,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
         field, plate = field + grown * grid.views.z_sites, plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
     field, plate = grid.free_parts_small(field, plate)
-    xy = raw.xy or grid_noise(problem, residuals)
+    xy = xy or grid_noise(problem, residuals)
 
     conditions = problem.conditions
     phi = parameters[system.phi_at] / length
@@ -547,26 +548,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     parameters[system.phi_at] = phi * length
     a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
     return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-                    misclosure, xy, theta.noise, raw.inverse, raw.ratio)
-
-
-def _solve_free(problem: Problem, y: np.ndarray, theta: AngularPart) -> FreeNetworkSolution:
-    system, grid = problem.system, problem.system.grid
-    n = 3 * grid.n_views
-    free, d = grid.reduced(y)
-    alone = system.grid_inverse @ d
-    field = (free - grid.response @ alone).reshape(grid.views.shape)
-    if not system.angular.n_views:
-        return FreeNetworkSolution(field, alone, None, system.grid_inverse)
-    xy = grid_noise(problem, grid.plate(y, field, alone)[1])
-    ratio = weight_ratio(problem, xy.sigma, theta.noise.sigma, y)
-    right = np.zeros(system.size)
-    right[:n] = d
-    right[system.phi_at] += ratio * problem.half_width_m * theta.d
-    inverse = system.inverse(ratio)
-    parameters = inverse @ right
-    field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
-    return FreeNetworkSolution(field, parameters, xy, inverse, ratio)
+                    misclosure, xy, theta.noise, inverse, ratio)
 
 
 def angular_part(problem: Problem) -> AngularPart:

@@ -209,6 +209,10 @@ class Gauge:
         n = self.known.size
         return q[:n] + 1j * q[n:]
 
+    def without(self, fields: np.ndarray) -> np.ndarray:
+        """Return fields (sites, ...), 0 where not known, without their parts in the modes."""
+        return fields - self.orthonormal @ np.real(self.orthonormal.conj().T @ fields)
+
     @property
     def everywhere(self) -> np.ndarray:
         """The modes of `orthonormal` at all sites, complex (sites, modes)."""

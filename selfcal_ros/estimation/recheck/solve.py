@@ -15,7 +15,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.datum.covariance import Conditions
-from selfcal_ros.estimation.joint.images import stops_of
+from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
@@ -248,7 +248,7 @@ def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, N
     problem, before, nan = readings.problem, plate.result.noise, float("nan")
     of_marks, of_mark, out = problem.repeats_xy, problem.grid.sigma_declared, []
     if len(readings.stop):
-        fewer = 1 + (readings.marks_of_image - 1) * share_of(plate.result)
+        fewer = 1 + (marks_of_image(readings.stop) - 1) * share_of(plate.result)
         of_marks, of_mark = (of_marks[0], of_marks[1] / fewer), nan
     for kind, repeats, declared in (
             ("xy", of_marks, of_mark),

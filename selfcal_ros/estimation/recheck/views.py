@@ -273,12 +273,6 @@ class PlateReadings:
         same = self.stop[:, None] == np.arange(self.stop.max() + 1)
         return np.kron(np.eye(2), same / np.sqrt(self.weight)[:, None])
 
-    @property
-    def marks_of_image(self) -> float:
-        """Number of marks of an image, as a mean over its marks; 1 without images."""
-        count = np.bincount(self.stop)
-        return float((count**2).sum() / count.sum()) if len(count) else 1.0
-
     @cached_property
     def marks(self) -> np.ndarray:
         """Which marks were read, bool (nx, ny)."""

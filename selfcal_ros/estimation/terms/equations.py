@@ -354,8 +354,7 @@ class TermEquations:
         """Map for a unit of each coefficient in the datum, complex (sites, p); 0 where unknown."""
         known = self.system.known_sites.ravel()[:, None]
         fields = np.where(known, self.projected.fields, 0.0)
-        basis = self.system.gauge.orthonormal
-        return np.where(known, fields - basis @ np.real(basis.conj().T @ fields), 0.0)
+        return np.where(known, self.system.gauge.without(fields), 0.0)
 
     @cached_property
     def turned(self) -> np.ndarray:

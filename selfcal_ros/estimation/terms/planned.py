@@ -8,6 +8,7 @@ are not known yet: misalignments and stop errors are drawn, always the same for 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import ndtri
@@ -25,8 +26,15 @@ from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_ya
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
-from selfcal_ros.model.view import Plan, View, placings_of, with_sub_views
-from selfcal_ros.model.visit_order import approach_signs, visit_sequence
+from selfcal_ros.model.view import (
+    DEFAULT_ORDER,
+    Plan,
+    View,
+    parse_order,
+    placings_of,
+    with_sub_views,
+)
+from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
 MISALIGNMENT_M = 30e-6
 """Standard deviation of the position of a plate along each axis."""
@@ -118,7 +126,9 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     """
     turn, x, y = known[0] * (assumed.turn_rad, MISALIGNMENT_M, MISALIGNMENT_M)
     errors = known[1]
-    found = visit_sequence(artifact, view, order=assumed.order, rng=rng)
+    order = assumed.order or view.visit_order or DEFAULT_ORDER
+    found = visit_sequence(artifact, view, order=order, rng=rng) if parse_order(
+        order).name == "random" else _sequence(artifact, replace(view, name=""), order)
     n, ends = len(found), (found.time[0], found.time[-1]) if len(found) else (0, 0)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
@@ -139,6 +149,12 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
                       view_time(found.time, *ends), np.exp(-1j * turn) * offset,
                       approach_signs((sites + aside).real).astype(float),
                       approach_signs((sites + aside).imag).astype(float), phase)
+
+
+@lru_cache(maxsize=256)
+def _sequence(artifact: Artifact, view: View, order: str) -> VisitSequence:
+    """Return the visits of a view: the hundreds of plans of a search share their views."""
+    return visit_sequence(artifact, view, order=order)
 
 
 def planned_equations(plan: Plan, system: NormalEquations, terms: Iterable[ModelTerm],

@@ -29,7 +29,13 @@ from scipy.special import fdtrc
 
 from selfcal_ros.blocks import AXES, Located, block_of, blocks
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
-from selfcal_ros.estimation.joint.problem import FLOOR, LEAST_PART, fit, noise_excess, pooled
+from selfcal_ros.estimation.joint.problem import (
+    FLOOR,
+    fit,
+    least_noise_rad,
+    noise_excess,
+    pooled,
+)
 from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
@@ -796,7 +802,7 @@ def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cau
 def _suspects(model: ModelFit, measurements: Measurements) -> Iterator[Cause]:
     """Yield the readings of lines with the largest residuals, each tested."""
     problem, system, angular = model.problem, model.problem.system, model.problem.system.angular
-    least = LEAST_PART * model.found.xy.sigma / problem.half_width_m
+    least = least_noise_rad(problem, model.found.xy.sigma)
     dof = angular.n_readings - system.rank_angular
     if dof < 2:
         return

@@ -229,9 +229,7 @@ def _squares(system: PlacedEquations, y: np.ndarray) -> float:
 def _apart(one: ModelFit, other: ModelFit) -> np.ndarray:
     """Return the squared difference of two maps of the same readings at places, (2 P,), m^2."""
     at = known_places(_of_marks(other))
-    rigid = _rigid(at)
-    field = _alone(one, at) - _alone(other, at)
-    field = field - rigid @ np.real(rigid.conj().T @ field)
+    field = _datum_of(at).without(_alone(one, at) - _alone(other, at))
     return np.concatenate([field.real, field.imag]) ** 2
 
 
@@ -242,9 +240,9 @@ def _alone(model: ModelFit, at: np.ndarray) -> np.ndarray:
     return spline.rows(at) @ spline.coefficients(system.alone(model.y)[0]).ravel()
 
 
-def _rigid(at: np.ndarray) -> np.ndarray:
-    """Return the orthonormal datum modes at places, complex (P, 4)."""
-    return Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True).orthonormal
+def _datum_of(at: np.ndarray) -> Gauge:
+    """Return the datum of a map at places, complex (P,)."""
+    return Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,8 +288,7 @@ class _Further:
         moved = (inside @ (answer @ beside) - beside) @ vectors
         scalar = np.asarray(spline.rows(at) @ np.hstack(np.split(moved, 2)))
         field = scalar[:, :moved.shape[1]] + 1j * scalar[:, moved.shape[1]:]
-        rigid = _rigid(at)
-        field -= rigid @ np.real(rigid.conj().T @ field)
+        field = _datum_of(at).without(field)
         alone = right - normal @ inside @ (np.linalg.pinv(
             inside.T @ normal @ inside, hermitian=True, rcond=GAP) @ (inside.T @ right))
         return cls(np.maximum(told, 0.0), vectors.T @ (beside.T @ alone),
