@@ -2,6 +2,7 @@
 """Truth of a machine, of a plate, and of each view of the plate on it."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -267,6 +268,15 @@ class Truth:
     walk_m: np.ndarray = _zeros(0, 2, 1)
     waves: Waves = NO_WAVES
     waves_theta: Waves = NO_WAVES
+
+    @cached_property
+    def bilinear(self) -> np.ndarray:
+        """The part of the stage error at the sites that is bilinear in between, (2, nx, ny), m."""
+        lattice = self.artifact.lattice
+        if not len(self.waves.number):
+            return self.g
+        sites = np.stack(lattice.places(lattice.m.ravel(), lattice.n.ravel()))
+        return self.g - self.waves.at(sites).reshape(self.g.shape)
 
     def placed_as(self, index: int, commanded: View) -> View:
         """Return the pose of the plate in view `index`."""

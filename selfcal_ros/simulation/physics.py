@@ -186,11 +186,9 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
     Bilinear between the sites, plus waves and the bending of the stage in that view.
     """
     artifact = truth.artifact.lattice
-    place, g = position / artifact.grid_pitch_m, truth.g
-    if len(truth.waves.number):
-        sites = np.stack(artifact.places(*all_marks(artifact)))
-        g = g - truth.waves.at(sites).reshape(g.shape)
-    error = between_sites(artifact, g, position) + stage_bending(truth, position, index)
+    place = position / artifact.grid_pitch_m
+    error = between_sites(artifact, truth.bilinear, position) + stage_bending(truth, position,
+                                                                             index)
     return error + truth.waves.at(place) if len(truth.waves.number) else error
 
 
