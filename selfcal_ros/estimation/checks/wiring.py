@@ -10,9 +10,7 @@ neither noise can favour another one. Noise of the position pulls the slope of t
 towards 0, noise of the offset the slope of the position: the scale is between the two.
 Of 2,000 clean simulated measurements none was refused (test_wiring.py).
 
-Offsets of a camera turned by quarters or mirrored, and lines of the other sign, without stops.
-
-A stage that rests on the marks does not show how the offsets follow it (`wiring`). But the plate
+A stage that rests on the marks does not show how the offsets follow it. But the plate
 never lies exactly as planned, and its displacement and turn differ from view to view: offsets D o
 for the true o fit one rigid plate only for the right D, apart from an overall sign of marks and
 lines together.

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several calibrations of one stage combined to one map, with the part between runs in its U.
 
-The runs of a mean: whether they are of one stage, what sets their scale, when they were.
-
-Several runs that measured the same values: mean, part between runs, deviation of each run.
-
 Run i gives x_i = G + e_i + s_i c + b_i: e_i its own error with the covariance C_i, c an error
 common to all runs of one machine (covariance K; s_i = 1, or 0 for a run of other origin), and b_i
 the part between runs. Its covariance T has one variance for each given shape, and one for the rest.

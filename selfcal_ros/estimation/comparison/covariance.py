@@ -4,11 +4,10 @@
 They are exact, including reference length and terms of the model. Without weights, only the
 variances of the map are known.
 
-Joint covariance of the maps of stage and plate, from a saved result.
-
-Exact for noise and terms of the model. What else enlarges u (unequal noise, noise in time, stages
-read beside the sites) enlarges both maps in the ratio in which it enlarges that of the stage;
-effects that are no terms enlarge the plate's by as much as the stage's, at every mark by itself.
+The joint covariance of the maps of stage and plate is exact for noise and terms of the model. What
+else enlarges u (unequal noise, noise in time, stages read beside the sites) enlarges both maps in
+the ratio in which it enlarges that of the stage; effects that are no terms enlarge the plate's by
+as much as the stage's, at every mark by itself.
 """
 
 import math

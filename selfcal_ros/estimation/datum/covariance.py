@@ -16,11 +16,9 @@ That gives the variance of every site. Stage and plate exchange their parts: a v
 on site X lays site X on mark m by the inverse pose. So on a lattice the variances of the plate are
 those of a stage in the exchanged equations, where the marks are left (method eq. 4.13).
 
-The angular maps of stage and plate: their datum, and their variances in it.
-
-The datum is zero mean, or Hu's four axis conditions (eqs. 9, 27). The four conditions fix one free
-constant and test three differences. They must not bend the XY map, so they act on Gtheta alone,
-with slopes and rotations from the readings.
+The datum of the angular maps is zero mean, or Hu's four axis conditions (eqs. 9, 27). The four
+conditions fix one free constant and test three differences. They must not bend the XY map, so they
+act on Gtheta alone, with slopes and rotations from the readings.
 """
 
 from dataclasses import dataclass

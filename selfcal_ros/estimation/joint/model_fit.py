@@ -7,9 +7,8 @@ what is left of phi is small. What finite rotations add to the linear model ther
 terms make of the readings, are taken off with the last solution until it stands still. Every step
 solves the same factored equations (Gauss-Newton).
 
-The fit of the same readings with a finer map, and the sizes of terms that it leaves.
-
-Between its nodes a map is a spline, and what a rougher stage has more looks like a bent or strained
+The same readings are fitted with a finer map, which may leave other sizes of terms. Between its
+nodes a map is a spline, and what a rougher stage has more looks like a bent or strained
 plate. A term, or a size, that the readings show with the map alone, and no more with a spline of
 twice as many intervals, explains nothing but the map (method section 12).
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be fitted, the noise of a reading, and how the two kinds of readings weigh.
+"""The joint least squares of one set of readings (method eq. 4.1).
 
-The joint least squares of one set of readings (method eq. 4.1).
+What is to be fitted, the noise of a reading, how the two kinds of readings weigh, and the fit.
 """
 
 import math

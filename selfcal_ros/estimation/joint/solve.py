@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration by joint least squares: readings to result.
 
-A solution before it is judged, and the parts of a fit that RESULT.json keeps.
-
-Residuals, so that a report can show them without the bag; and the part of the map's covariance
-that terms of the model make. With factors L (r, 2, nx, ny), cov(G) = sigma^2 (S + sum_r L_r L_r'),
-where S follows from the weights of the readings, so that saved maps are compared exactly. Each
-factor belongs to a term with a size, being what the map would gain if that term were known, or to
-the free terms together.
+RESULT.json keeps parts of a fit. Residuals, so that a report can show them without the bag; and the
+part of the map's covariance that terms of the model make. With factors L (r, 2, nx, ny), cov(G) =
+sigma^2 (S + sum_r L_r L_r'), where S follows from the weights of the readings, so that saved maps
+are compared exactly. Each factor belongs to a term with a size, being what the map would gain if
+that term were known, or to the free terms together.
 """
 
 import math

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lattice maps of a set of views: from fields over sites to fields over marks, and back.
+"""The maps of a set of views: from fields over nodes to fields over marks, and back.
+
+On a lattice the nodes are the sites.
 
 Vectors are complex numbers, z = x + iy, so that a quarter turn is a multiplication by i. In the
 plate frame the model (method eq. 2.4, Hu 12-15) reads, for view v with q quarter turns,
@@ -7,9 +9,7 @@ plate frame the model (method eq. 2.4, Hu 12-15) reads, for view v with q quarte
 A finite rotation adds (R(phi) - 1 - phi J) R^q m + (R(phi) - 1) R^q A to it (method eq. 2.6), with
 R(phi) = exp(i phi).
 
-The maps of views at any pose: from fields over nodes to fields over marks, and back.
-
-In the plate frame the model reads, for view v turned by alpha_v (method eqs. 12.1, 12.2),
+At any pose it reads, for view v turned by alpha_v (method eqs. 12.1, 12.2),
     y_v(m) = e^(-i alpha_v) G(X_v(m)) + A(m) + phi_v i z(m) + tau_v,
     G(X) = sum_j w_j(X) G_j,   w real, sum w = 1,
 with G_j the error at node j. On the lattice w is 1 at one site.

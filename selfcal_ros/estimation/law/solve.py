@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hu's self-calibration law, for comparison with the joint solution (method eqs. 5.1-5.10).
 
-Hu's law as linear maps on arrays, step by step (Hu eqs. 16-28, method eqs. 5.1-5.10).
-
-Every array has a last axis of columns, so that the same code solves the readings (one column)
-and propagates the noise of each reading (one column per reading).
+Its steps are linear maps on arrays (Hu eqs. 16-28). Every array has a last axis of columns, so that
+the same code solves the readings (one column) and propagates the noise of each reading (one column
+per reading).
 """
 
 from collections.abc import Callable

@@ -7,13 +7,12 @@ with K = J' J and W = J' Y', Z12 = -W Z22, Z11 = K - Z12 W', with Z22 taken from
 All this is real except for the cut, which is solved last; only the real part of its inverse
 enters the diagonal.
 
-The elimination order: the field folded into a quadrant, and its nested dissection.
-
-With G(X) = i^k h(X), k the quadrant of X, and the like for marks, a reading whose mark and site
-lie k quarter turns apart, as the view turns them, joins h and A by the real number 1. Only a
-shift across an axis leaves a factor i^g. The few sites that such readings touch are the cut:
-each gets one real copy for every g, and copies are joined by i^g h(X) at the very end. All the
-rest of the elimination is real (method eq. 8.1).
+The elimination order is a nested dissection of the field folded into a quadrant. With G(X) = i^k
+h(X), k the quadrant of X, and the like for marks, a reading whose mark and site lie k quarter turns
+apart, as the view turns them, joins h and A by the real number 1. Only a shift across an axis
+leaves a factor i^g. The few sites that such readings touch are the cut: each gets one real copy for
+every g, and copies are joined by i^g h(X) at the very end. All the rest of the elimination is real
+(method eq. 8.1).
 
 A mark joins only sites that quarter turns and small shifts carry into each other. Folded into
 one eighth of the plane, (max(|i|, |j|), min(|i|, |j|)), such sites are neighbours, so straight

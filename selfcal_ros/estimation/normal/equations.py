@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The normal equations of a measured plan, grid and lines together, and what they determine.
 
-Normal equations of views at any pose (method eq. 12.3): dense, known by their uncertainty.
+Those of views at any pose are dense (method eq. 12.3). A mark's row has nodes of all views at
+different places, so that the matrix over the nodes is nearly full: it is complex Hermitian, and
+factorised as such. No graph tells what is known. Nodes are known if their standard uncertainty in
+the datum is below `KNOWN` readings' noise; the datum is that of the known nodes.
 
-A mark's row has nodes of all views at different places, so that the matrix over the nodes is
-nearly full: it is complex Hermitian, and factorised as such. No graph tells what is known. Nodes
-are known if their standard uncertainty in the datum is below `KNOWN` readings' noise; the datum is
-that of the known nodes.
-
-Normal equations of plans, planned or measured, and what is computed once for each of them.
+Equations are made once for each plan, planned or measured, and kept.
 """
 
 import hashlib

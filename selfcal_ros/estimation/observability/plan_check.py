@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a plan identifies the stage, its unseen modes, and the views that would remove them.
 
-Standard uncertainties predicted for a plan before measurement.
+And the standard uncertainties that it will have.
 """
 
 import math

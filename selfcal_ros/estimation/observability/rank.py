@@ -6,11 +6,9 @@ of graph components (`lattice.connectivity`); the misalignments add the rank of 
 three rows per view, whose zeros and non-zeros are ten orders of magnitude apart (method eqs. 6.1,
 6.2).
 
-Unseen fields of the stage under a deficient plan, named and as maps.
-
-There are two sources (method eq. 6.1): a component of sites and marks that no closed path of
-readings turns leaves a vector free; and undetermined combinations of misalignments move whole
-fields.
+Unseen fields of the stage have two sources (method eq. 6.1): a component of sites and marks that no
+closed path of readings turns leaves a vector free; and undetermined combinations of misalignments
+move whole fields.
 """
 
 import math

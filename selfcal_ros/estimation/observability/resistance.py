@@ -8,10 +8,9 @@ and the residuals explain, in units of the noise, a sum of squares distributed a
     sum_k (1 + lambda_k s^2 / sigma^2) chi^2(1)     for coefficients of standard deviation s,
 with lambda_k the eigenvalues of the information on b given the model.
 
-The predicted uncertainty budget of a plan: noise of the readings, and assumed terms.
-
-What the readings will not determine of a term with a size stays in U (GUM type B). What removes it
-is found by trying: check stops, another visiting order, a further view.
+The predicted budget has the noise of the readings and the assumed terms. What the readings will not
+determine of a term with a size stays in U (GUM type B). What removes it is found by trying: check
+stops, another visiting order, a further view.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

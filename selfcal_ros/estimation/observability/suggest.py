@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which view to measure next, and the best plan for a given number of views.
 
-The best pose of a view whose plate may lie anywhere, found by a pattern search.
-
-Turns are tried in whole degrees and shifts in tenths of a pitch: a plate is not placed better than
-that on purpose, and the uncertainty is flat about its minimum.
+Where the plate may lie anywhere a pattern search finds the best pose of a view. Turns are tried in
+whole degrees and shifts in tenths of a pitch: a plate is not placed better than that on purpose,
+and the uncertainty is flat about its minimum.
 """
 
 import math

@@ -9,8 +9,6 @@ contribution to the sum of squares, at a level that n good readings, marks and l
 with probability OUTLIER_LEVEL). Before that a view in which the plate slipped is split, unless a
 term of the model explains the readings better.
 
-Residuals with their leverage, the share of a reading that the fit follows; noisy views.
-
 The leverage h of a reading is the share of it that the fit follows; its residual has the standard
 deviation sigma sqrt((1 - h) / weight). For a grid reading of weight w in a mark of total weight W,
 h = w (1/W + var(x - mean x)), with x the part of the model other than the plate's error. Its two
@@ -19,8 +17,6 @@ coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rota
 Grid and angular readings are fitted separately here, so that the sums of squares of each kind have
 exactly known distributions. Views noisier than the others are found by their own repeats and by
 their residuals.
-
-Slips of the plate within a view: find and size them, split the view into two placements.
 
 A view is read line by line. If the plate slips on the way, the rest of the view has another
 misalignment. For each view and each line the gain of a second misalignment is tested: the sum of

@@ -5,8 +5,6 @@ Small residuals prove nothing; a prediction can fail. A tenth of the readings, o
 held out, the rest is calibrated, and the readings held out are predicted. The three misalignments
 of a whole view are fitted to its readings first, as no calibration can know them.
 
-Distribution of the prediction error of readings that were held out of a fit.
-
 The error comes from the noise of the reading, from the error of the fit, and in a view that was
 held out as a whole from its own terms within their sizes. Its sum of squares over the noise is a
 weighted sum of chi^2; seeded draws of unit noise through the same fit give mean and variance, and

@@ -4,11 +4,10 @@
 The new map rests on the plate that the earlier calibration found together with its own map: what
 it got wrong in one is in the other as well (method eq. 13.3).
 
-Whether a map has changed, and how large a change is found (method eq. 13.4).
-
-Three statistics of the same change: one for a change at all nodes, one for a change at few, one for
-a smooth change. Draws of the change's noise give the probability of the most telling of the three;
-every other one tells how large a change is found.
+Whether it has changed (method eq. 13.4) is told by three statistics of the same change: one for a
+change at all nodes, one for a change at few, one for a smooth change. Draws of the change's noise
+give the probability of the most telling of the three; every other one tells how large a change is
+found.
 """
 
 from dataclasses import dataclass, replace

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plate that a calibration made known, and the map of the stage that it found with it.
 
-Whether what was read is the known plate, placed as planned (method eq. 13.5).
-
-With the stage as it was, the readings of a view less both known maps leave motion, strain and
-noise. A wrong pose or another plate leaves differences of marks instead: unlike a change of the
-stage, they have nothing in common from one mark to the next.
+What was read must be that plate, placed as planned (method eq. 13.5). With the stage as it was, the
+readings of a view less both known maps leave motion, strain and noise. A wrong pose or another
+plate leaves differences of marks instead: unlike a change of the stage, they have nothing in common
+from one mark to the next.
 """
 
 from dataclasses import dataclass, replace

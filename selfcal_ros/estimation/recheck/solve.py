@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Views of a known plate to a result: the map of the stage, its uncertainty, what has changed.
 
-Predictions for views of a known plate, before any is measured.
+Before any is measured, readings that are all 0 predict its uncertainty.
 """
 
 from collections.abc import Iterator

@@ -3,12 +3,10 @@
 
 In the plate frame; each block says its own (`selfcal_ros.blocks`).
 
-Columns at the marks, stored as complex shapes; a column is 1 or i times a shape.
-
-Most terms come in pairs, the same along x and along y, and most belong to one view: a drift of
-degree 3 in five views has 30 columns of 5 x 441 numbers each, and 15 shapes of 441. Up to the
-misalignments the equations are linear over the complex numbers and computed for the shapes; the
-products of the columns follow:
+At the marks they are stored as complex shapes; a column is 1 or i times a shape. Most terms come in
+pairs, the same along x and along y, and most belong to one view: a drift of degree 3 in five views
+has 30 columns of 5 x 441 numbers each, and 15 shapes of 441. Up to the misalignments the equations
+are linear over the complex numbers and computed for the shapes; the products of the columns follow:
 
     Re(conj(u c) v d) = Re(conj(u) v <c, d>),     u, v in {1, i}
 """

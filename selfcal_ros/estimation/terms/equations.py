@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The equations of the terms' coefficients: which are determined, their values and covariance.
 
-Columns projected by the estimate of map, plate and misalignments: effects and residuals.
-
-The estimate without terms is linear: y -> (G, misalignments) with residuals (1 - P) y. A term's
-column c has the map F = G(c) and the residuals r = (1 - P) c. The terms then follow by
-partitioned regression (Frisch and Waugh):
+The estimate of map, plate and misalignments projects the columns. The estimate without terms is
+linear: y -> (G, misalignments) with residuals (1 - P) y. A term's column c has the map F = G(c) and
+the residuals r = (1 - P) c. The terms then follow by partitioned regression (Frisch and Waugh):
     (r'W c + within + sigma^2/size^2) b = c'W e + within,
     G = G(y) - F b,     cov G = S + F cov(b) F'
 With the marks, then the sites (matrix M, right-hand side s), then the misalignments (right-hand
 side d, covariance C) eliminated, r'W c = c'W c - mean' W mean - s' M^-1 s - d' C d. Up to the last
 step everything is linear over the complex numbers and done for the shapes of the columns.
 
-Whether the readings determine the terms of the model, and agree with their given sizes.
-
-The coefficients of a term, estimated without their size, have b ~ N(0, C + size^2 1), with
-C their covariance (method eq. 7.9). If this is contradicted, the readings give another size:
-that at which b' (C + size^2 1)^-1 b equals its rank (Paule and Mandel 1982), and at most that at
-which it is improbably small.
+Sizes are tested against the readings. The coefficients of a term, estimated without their size,
+have b ~ N(0, C + size^2 1), with C their covariance (method eq. 7.9). If this is contradicted, the
+readings give another size: that at which b' (C + size^2 1)^-1 b equals its rank (Paule and Mandel
+1982), and at most that at which it is improbably small.
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Causes: explanations with their largest component and its place; faults of angular lines.
+"""What explains the residuals, as causes: with the largest component of each, and its place.
 
-Test whether the stage stopped so far from the sites that its error there is unknown.
+A stage may have stopped so far from the sites that its error there is unknown. A reading contains
+the stage error at the position of the stage (method eq. 7.10), and the map gives it between its
+sites by a spline. Two splines through the sites differ if the stage is rough from site to site, and
+the maps with them; a solution that takes the sites for the positions misses the whole difference.
+If all views are displaced alike, residuals show neither.
 
-A reading contains the stage error at the position of the stage (method eq. 7.10), and the map gives
-it between its sites by a spline. Two splines through the sites differ if the stage is rough from
-site to site, and the maps with them; a solution that takes the sites for the positions misses the
-whole difference. If all views are displaced alike, residuals show neither.
-
-What explains the residuals: terms, slips, single readings (method eqs. 7.7, 7.8).
-
-A term that the model does not hold is tested by the sum of squares that its columns explain, with
-as many degrees of freedom as the readings determine of them (F-test against the remainder). The
-best one (Bayesian information criterion) is accepted first, and the others are tested together with
-it, so that one cause does not appear under many names. Of terms that explain the same equally well
-all are returned: the readings do not determine which of them it is.
+Terms, slips and single readings explain residuals (method eqs. 7.7, 7.8). A term that the model
+does not hold is tested by the sum of squares that its columns explain, with as many degrees of
+freedom as the readings determine of them (F-test against the remainder). The best one (Bayesian
+information criterion) is accepted first, and the others are tested together with it, so that one
+cause does not appear under many names. Of terms that explain the same equally well all are
+returned: the readings do not determine which of them it is.
 """
 
 import math
