@@ -150,10 +150,12 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
         if view.cell not in (None, (0, 0)) or (
                 len(names) == 2 and view.plan_view == names[0]):  # their relative pose alone counts
             continue
+        moved = [number for number, (also, _) in enumerate(told)
+                 if also.plan_view == view.plan_view]
+        kept = _Kept(views, moved, *sizes)
         for pose in _poses(seen, artifact):
-            moved = [_moved(other, seen.pose, pose) if also.plan_view == view.plan_view else other
-                     for also, other in told]
-            likelihood, left = _likelihood(moved, *sizes)
+            likelihood, left = kept.with_moved([
+                _moved(views[number], seen.pose, pose) for number in moved])
             tried.append((likelihood - planned, left, view, seen.pose, pose))
     tried.sort(key=lambda item: -item[0])
     best = max(tried[0][0] if tried else 0.0, 0.0)
@@ -311,25 +313,80 @@ def _likelihood(views: list[_Seen], noise: float, spread: float,
 
     Each view's own parameters are removed. `stage`: see `_alike`.
     """
-    turn = np.concatenate([np.full(len(seen.place), seen.pose.phase) for seen in views])
-    mark = np.round(np.concatenate([seen.marks for seen in views]), 3)
-    covariance = spread**2 / 2 * (
-        stage + np.equal.outer(mark, mark) * np.multiply.outer(turn, turn.conj()))
-    covariance[np.diag_indices(len(mark))] += noise**2
-    free, start = np.zeros((len(mark), FREE * len(views)), dtype=complex), 0
-    for number, seen in enumerate(views):
-        end = start + len(seen.place)
-        free[start:end, FREE * number:FREE * (number + 1)] = _motion(seen)
-        start = end
-    factor = np.linalg.cholesky(covariance)
-    values = np.concatenate([seen.deviation for seen in views])
-    white = np.linalg.solve(factor, np.column_stack([free, values]))
-    inner = white[:, :-1].conj().T @ white
-    square = (np.linalg.norm(white[:, -1]) ** 2
-              - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)
-    likelihood = (-square / 2 - 2 * np.log(np.diag(factor).real).sum()
-                  - np.linalg.slogdet(inner[:, :-1])[1])
-    return float(likelihood), float(square / 2 / (len(mark) - free.shape[1]))
+    return _Kept(views, [], noise, spread, stage).with_moved([])
+
+
+class _Kept:
+    """Readings that stay while others are tried at many poses, factored once for all of them.
+
+    Parameters
+    ----------
+    views : list of _Seen
+        Readings of all views.
+    moved : list of int
+        Those of which other poses are tried.
+    noise, spread, stage
+        As `_likelihood` takes them.
+    """
+
+    def __init__(self, views: list[_Seen], moved: list[int], noise: float, spread: float,
+                 stage: np.ndarray) -> None:
+        self.noise, self.spread, self.free = noise, spread, FREE * len(views)
+        of_view = np.repeat(np.arange(len(views)), [len(seen.place) for seen in views])
+        tried = np.isin(of_view, moved)
+        kept = np.flatnonzero(~tried)
+        self.beside, self.own = stage[np.ix_(kept, tried)], stage[np.ix_(tried, tried)]
+        self.views = [seen for number, seen in enumerate(views) if number not in moved]
+        factor = np.linalg.cholesky(self._covariance(
+            self.views, self.views, stage[np.ix_(kept, kept)]))
+        self.sizes, self.whiten = np.diag(factor).real, np.linalg.inv(factor)
+        self.white = self.whiten @ self._columns(self.views, 0)
+
+    def with_moved(self, moved: list[_Seen]) -> tuple[float, float]:
+        """Return the likelihood of all readings with those of the others at these poses."""
+        white, sizes = self.white, self.sizes
+        if moved:
+            beside = self.whiten @ self._covariance(self.views, moved, self.beside)
+            factor = np.linalg.cholesky(
+                self._covariance(moved, moved, self.own) - beside.conj().T @ beside)
+            rest = self._columns(moved, len(self.views)) - beside.conj().T @ white
+            white = np.concatenate([white, np.linalg.solve(factor, rest)])
+            sizes = np.concatenate([sizes, np.diag(factor).real])
+        inner = white[:, :-1].conj().T @ white
+        square = (np.linalg.norm(white[:, -1]) ** 2
+                  - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)
+        likelihood = (-square / 2 - 2 * np.log(sizes).sum()
+                      - np.linalg.slogdet(inner[:, :-1])[1])
+        return float(likelihood), float(square / 2 / (len(white) - self.free))
+
+    def _covariance(self, some: list[_Seen], others: list[_Seen], stage: np.ndarray) -> np.ndarray:
+        """Return the covariance of readings, `stage` that of the stage's errors in them."""
+        (turn, mark), (other_turn, other_mark) = map(_on_plate, (some, others))
+        covariance = self.spread**2 / 2 * stage.astype(complex)
+        one, other = np.equal.outer(mark, other_mark).nonzero()
+        covariance[one, other] += self.spread**2 / 2 * turn[one] * other_turn[other].conj()
+        if some is others:
+            covariance.flat[::len(mark) + 1] += self.noise**2
+        return covariance
+
+    def _columns(self, views: list[_Seen], first: int) -> np.ndarray:
+        """Return the columns of all views' own parameters, and the deviations; `first`: of these.
+
+        Complex (n, free + 1).
+        """
+        rows = []
+        for number, seen in enumerate(views, first):
+            row = np.zeros((len(seen.place), self.free + 1), dtype=complex)
+            row[:, FREE * number:FREE * (number + 1)] = _motion(seen)
+            row[:, -1] = seen.deviation
+            rows.append(row)
+        return np.concatenate(rows)
+
+
+def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
+    """Return turns of the plate and marks of all readings, complex (n,) each."""
+    return (np.concatenate([np.full(len(seen.place), seen.pose.phase) for seen in views]),
+            np.round(np.concatenate([seen.marks for seen in views]), 3))
 
 
 def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:

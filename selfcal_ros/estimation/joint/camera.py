@@ -45,7 +45,7 @@ STEP_M = 1e-6
 """Half the distance over which the slope of the distortion is taken, small in any camera."""
 
 STEPS = 20
-"""Steps from a published offset to the true one; each is shorter by the slope of the distortion."""
+"""Most steps from a published offset to the true one: each is shorter by the slope of the error."""
 
 Powers = Sequence[tuple[int, int]]
 
@@ -69,7 +69,9 @@ class Distortion:
         """Return the error at published offsets, complex, m: that at the true ones."""
         error = np.zeros_like(offset)
         for _ in range(STEPS):
-            error = _terms(offset - error, self.powers) @ self.coefficients
+            before, error = error, _terms(offset - error, self.powers) @ self.coefficients
+            if np.array_equal(error, before):
+                break
         return error
 
 
@@ -127,7 +129,10 @@ class Camera(Distortion):
 
 def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
     """Return 1 and the powers of places, complex (..., 1 + powers)."""
-    return np.stack([np.ones_like(z), *(z**a * np.conj(z)**b for a, b in powers)], axis=-1)
+    power = [np.ones_like(z)]
+    for _ in range(max(map(max, powers), default=0)):
+        power.append(power[-1] * z)
+    return np.stack([power[0], *(power[a] * power[b].conj() for a, b in powers)], axis=-1)
 
 
 def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:

@@ -116,7 +116,8 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     other = with_map(model, grid.views.spline.refined)
     if other is None:
         return None
-    fine, n = _of_marks(other), [told_coefficients(one) for one in (_of_marks(other), coarse)]
+    fine = _of_marks(other)
+    n = [told_coefficients(one) for one in (fine, coarse)]
     before, rest = _squares(coarse, model.y), _squares(fine, other.y)
     readings = equations_left(grid)
     more, dof, p = n[0] - n[1], readings - n[0], 1.0
@@ -281,16 +282,15 @@ class _Further:
         contained = nodes.within(spline)
         further = np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
         inside, beside = (np.kron(np.eye(2), part) for part in (contained, further))
-        answer = np.linalg.pinv(inside.T @ normal @ inside, hermitian=True,
-                                rcond=GAP) @ (inside.T @ normal)
+        inverse = np.linalg.pinv(inside.T @ normal @ inside, hermitian=True, rcond=GAP)
+        answer = inverse @ (inside.T @ normal)
         left = beside.T @ (normal - normal @ inside @ answer)
         told, vectors = np.linalg.eigh(left @ beside)
         moved = (inside @ (answer @ beside) - beside) @ vectors
         scalar = np.asarray(spline.rows(at) @ np.hstack(np.split(moved, 2)))
         field = scalar[:, :moved.shape[1]] + 1j * scalar[:, moved.shape[1]:]
         field = _datum_of(at).without(field)
-        alone = right - normal @ inside @ (np.linalg.pinv(
-            inside.T @ normal @ inside, hermitian=True, rcond=GAP) @ (inside.T @ right))
+        alone = right - normal @ inside @ (inverse @ (inside.T @ right))
         return cls(np.maximum(told, 0.0), vectors.T @ (beside.T @ alone),
                    np.concatenate([field.real, field.imag]))
 
