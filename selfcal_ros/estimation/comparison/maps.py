@@ -101,10 +101,14 @@ class Spread:
 
     def squares(self, ratio: np.ndarray) -> np.ndarray:
         """Return the squared Mahalanobis distances of values over `u`, (n, ...)."""
+        return (self.white(ratio) ** 2).sum(axis=0)
+
+    def white(self, ratio: np.ndarray) -> np.ndarray:
+        """Return values over `u`, (n, ...), along their axes, of variance 1, (r, ...)."""
         if not self.correlated:
-            return (ratio**2).sum(axis=0)
+            return ratio
         size, axes = self._axes
-        return (((axes.T @ ratio).T / size) ** 2).sum(axis=-1)
+        return ((axes.T @ ratio).T / size).T
 
     @cached_property
     def drawn(self) -> np.ndarray:

@@ -84,13 +84,21 @@ class ChangeTests(Spread):
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """Return the three statistics of changes (2n, draws), (3, draws)."""
-        ratio = values / self.u[:, None]
-        few = np.hypot(*ratio.reshape(2, -1, ratio.shape[1]))
+        every, smooth = ((white**2).sum(axis=0) for white in self._white(values))
+        return np.stack([every, self._of_few(values), smooth])
+
+    def _white(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the squares of the first and third statistic are of, (..., draws)."""
+        return self.white(values / self.u[:, None]), self._whiten_smooth @ values
+
+    def _of_few(self, values: np.ndarray) -> np.ndarray:
+        """Return the second statistic of changes (2n, draws), (draws,)."""
+        few = np.hypot(*(values / self.u[:, None]).reshape(
+            2, len(self.places), values.shape[1]))
         part = FEW / len(few)
         likelier = np.logaddexp(np.log1p(-min(part, 0.5)), np.log(part) + LARGE * few
                                 - LARGE**2 / 2 + np.log(i0e(LARGE * few)))
-        return np.stack([self.squares(ratio), likelier.sum(axis=0),
-                         ((self._whiten_smooth @ values) ** 2).sum(axis=0)])
+        return likelier.sum(axis=0)
 
     @cached_property
     def _noise(self) -> np.ndarray:
@@ -141,11 +149,20 @@ class ChangeTests(Spread):
                             for shape in (one, smooth)))
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
-        """Return the size of a change of given shape of which POWER are found, by bisection."""
+        """Return the size of a change of given shape of which POWER are found, by bisection.
+
+        Two of the statistics are squares, in which the size is that of a parabola.
+        """
         low, high = 0.0, 20 * rms(self.u)
+        curves = [((one**2).sum(axis=0) - limit, 2 * (one * other).sum(axis=0),
+                   (other**2).sum(axis=0)) for one, other, limit in zip(
+            self._white(noise), self._white(shape), limits[[0, 2]], strict=True)]
         for _ in range(10):
             size = (low + high) / 2
-            enough = (self.of(noise + size * shape) >= limits).any(axis=0).mean() >= POWER
+            found = np.any([c + size * (b + size * a) >= 0 for c, b, a in curves], axis=0)
+            left = ~found
+            found[left] = self._of_few(noise[:, left] + size * shape[:, left]) >= limits[1]
+            enough = found.mean() >= POWER
             low, high = (low, size) if enough else (size, high)
         return high
 
