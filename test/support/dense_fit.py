@@ -6,7 +6,7 @@ stage frame, every unknown a column, every size a row b / size. The columns are 
 the whole model predicts, so that plates that turn by finite angles have theirs, too.
 """
 
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -153,8 +153,8 @@ class DenseFit:
         field = g.reshape(self.artifact.shape)
         for _ in range(3):  # true = indicated - error
             true = (self.stage - error) / self.pitch
-            along = (CubicSpline(np.arange(size), np.eye(size))(part + half) for size, part, half
-                     in zip(field.shape, (true.real, true.imag), (self.hx, self.hy), strict=True))
+            along = (splines_of(size)(part + half) for size, part, half in zip(
+                field.shape, (true.real, true.imag), (self.hx, self.hy), strict=True))
             error = np.einsum("vi,vj,ij->v", *along, field)
         return error
 
@@ -387,6 +387,12 @@ class DenseFit:
         u = np.sqrt(np.diag(self.covariance)[self.b])
         return {(str(term), names[v], part): (value, spread) for (term, v, part), value, spread
                 in zip(self.keys, self.p[self.b], u, strict=True)}
+
+
+@cache
+def splines_of(size):
+    """Return the splines that are 1 at one of so many places and 0 at the others."""
+    return CubicSpline(np.arange(size), np.eye(size))
 
 
 def inverse_of(matrix):

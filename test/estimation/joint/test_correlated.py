@@ -63,7 +63,7 @@ def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlat
 
 
 def test_slow_noise_is_in_the_uncertainty(monkeypatch):
-    flat = Options(terms=parse_terms(["plate_shape:0"], ""))
+    flat = Options(terms=parse_terms(["plate_shape:0"], ""), causes=False)
     inside, unaware = [], []
     for seed in range(4):
         truth, readings = measured(11, seed, slow_m=20e-9)

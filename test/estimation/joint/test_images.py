@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.joint.camera import Distortion, straight_products
-from selfcal_ros.estimation.joint.images import image_noise
+from selfcal_ros.estimation.joint.images import IMAGES, image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.equations import system_for
@@ -156,12 +156,12 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
     assert images.marks == pytest.approx(np.mean([(stops == stop).sum() for stop in stops]))
 
 
-def population(image_m: float, size: int, runs: int, **settings):
+def population(image_m: float, size: int, runs: int, *, options: Options | None = None, **settings):
     """Return (G - truth) / u of every node and run, and the truths and results."""
     away, results = [], []
     for seed in range(runs):
         truth, measurements = measured(image_m, seed, size=size, **settings)
-        found = calibrate(measurements)
+        found = calibrate(measurements, options)
         emap = found.error_map
         error = np.stack([emap.gx, emap.gy]) - truth.g
         away.append(error / np.stack([emap.u_gx, emap.u_gy]))
@@ -176,7 +176,7 @@ def within(away: np.ndarray, independent: int, *, least: float = 0.9) -> None:
     """
     n = len(away) * independent
     assert binom.ppf(1e-4, n, 0.9545) <= (np.abs(away) < 2).mean() * n
-    assert least < np.sqrt((away**2).mean()) < 1.1
+    assert least < np.sqrt((away**2).mean()) < np.sqrt(chi2.ppf(0.999, n) / n)
 
 
 def away_of(truth, camera) -> np.ndarray:
@@ -192,8 +192,8 @@ DISTORTED = {"microscope_distortion": 0.02, "microscope_field_m": 1.414e-3,
 
 
 @pytest.mark.parametrize(("part", "size", "sense", "runs"), [
-    (0.3, 7, Sense.MICROSCOPE_MOVES, 16), (1.0, 11, Sense.PLATE_MOVES, 6),
-    (3.0, 7, Sense.MICROSCOPE_MOVES, 40)])  # the more images share, the fewer numbers a run has
+    (0.3, 7, Sense.MICROSCOPE_MOVES, 8), (1.0, 9, Sense.PLATE_MOVES, 6),
+    (3.0, 7, Sense.MICROSCOPE_MOVES, 16)])  # the more images share, the fewer numbers a run has
 def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense, runs):
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
     assert all(found.verdict.qualified for _, found in results)
@@ -203,7 +203,8 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
     assert all(camera["degree"] == 3 for camera in cameras)
     mark, image = (np.mean([camera[name] ** 2 for camera in cameras])
                    for name in ("noise_mark", "noise_image"))
-    assert mark == pytest.approx(MARK**2, rel=0.06)
+    dof = sum(found.extra[IMAGES]["dof_mark"] for _, found in results)
+    assert mark == pytest.approx(MARK**2, rel=3 * np.sqrt(2 / dof))
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
     for camera in cameras:  # published offsets are (1 + E)^-1 times the true ones, then distorted
         assert camera["scale"] == pytest.approx(-0.005, abs=1e-4)
@@ -217,14 +218,14 @@ def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
     """Every stop is 1 um off, so that the repeats show the pixel size to 0.1 %."""
     off = {"microscope_scale": 0.005, "microscope_rotation_rad": -0.02,
            "microscope_distortion": 0.02, "microscope_field_m": 1.414e-3}
-    for seed in range(3):
+    for seed in range(2):
         _, readings = measured(MARK, seed, repeats=4, sense=sense, servo_m=1e-6, **off)
-        assert calibrate(readings).verdict.qualified
+        assert calibrate(readings, Options(causes=False)).verdict.qualified
         longer = np.diag([1.0, 1.0, 1.01, 1.01])
         views = tuple(replace(view, motion=replace(
             view.motion, products=longer @ view.motion.products @ longer))
             for view in readings.views)
-        failed = calibrate(replace(readings, views=views)).verdict.failed
+        failed = calibrate(replace(readings, views=views), Options(causes=False)).verdict.failed
         assert [one.name for one in failed] == ["scale_of_offsets"]
 
 
@@ -247,12 +248,12 @@ def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
 
 def test_degrees_of_freedom_are_those_of_the_maps_variance():
     power, dof = [], []
-    for seed in range(120):
+    for seed in range(60):
         found = solve_joint(measured(3 * MARK, seed, size=5)[1], ALONE).result
         power.append((found.error_map.u_gx**2).mean())
         dof.append(found.noise.dof_xy)
     shown = 2 * np.mean(power) ** 2 / np.var(power, ddof=1)
-    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 1/1.3 and 1.3
+    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 0.7 and 1.4
     assert np.mean(dof) < 100
 
 
@@ -268,9 +269,9 @@ def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
 
 
 def test_a_camera_without_distortion_has_a_linear_error():
-    _, results = population(MARK, 5, 12, repeats=2)
+    _, results = population(MARK, 5, 8, repeats=2)
     cameras = [found.extra["camera"] for _, found in results]
-    assert sum(camera["degree"] == 1 for camera in cameras) >= 11
+    assert sum(camera["degree"] == 1 for camera in cameras) >= 7
     assert not any(found.verdict.causes for _, found in results)
     scale = [camera["scale"] / camera["u_scale"] for camera in cameras]
     assert np.sqrt(np.mean(np.square(scale))) < 1.8

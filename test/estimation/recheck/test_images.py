@@ -25,6 +25,7 @@ from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
 LINEAR = bare(causes=False, at_places=False, misalignment_model="linear")
+RUNS = 7
 
 
 def sessions(image_m, seed, *, size=7, turn=0, repeats=1, change=0.0, missing=0.0,
@@ -121,7 +122,7 @@ def population(image_m, runs, **settings):
     away, changes, results = [], [], []
     for seed in range(runs):
         later, before, after = sessions(image_m, seed, plate_shape_m=5e-9, **settings)
-        first = calibrate(before)
+        first = calibrate(before, Options(causes=False))
         result = calibrate(after, Options(plate=first, plate_from="r.json"))
         emap, told = result.error_map, result.recheck
         modes = datum_modes(emap.artifact, scale=True)
@@ -144,11 +145,11 @@ def require_within(away: np.ndarray) -> None:
     (0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}),
     (1.0, {"repeats": 2, **DISTORTED})])
 def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
-    away, changes, results = population(part * MARK, 12, **settings)
+    away, changes, results = population(part * MARK, RUNS, **settings)
     assert all(result.verdict.qualified or result.recheck.changed for result in results)
     require_within(away)
     require_within(changes)
-    assert sum(result.recheck.changed for result in results) <= 2
+    assert sum(result.recheck.changed for result in results) <= binom.ppf(0.999, RUNS, 0.05)
 
 
 def test_a_changed_stage_is_said_to_have_changed():

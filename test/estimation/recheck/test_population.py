@@ -7,7 +7,7 @@ from scipy.stats import binom
 
 from tools.rechecking import Case, run
 
-MACHINES = 10
+MACHINES = 6
 
 
 @pytest.mark.parametrize("plan", ["lattice", "general six"])

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
@@ -23,6 +24,7 @@ from test.support.truth import random_truth, simulate_measurements
 PLAN = plan_of("0,90,tx", Artifact(5, 0.01))
 EXPANSION, U_EXPANSION, U_KELVIN = 8e-6, 4e-7, 0.05
 LENGTH, U_LENGTH = 2e-6, 2e-7
+STAGES = 12
 
 
 def of_length(truth, scale):
@@ -55,12 +57,13 @@ def session(seed, warmer, *, told=True, sense=Sense.MICROSCOPE_MOVES):
     return recheck(again, Options(terms=parse_terms(["plate_shape:0"], "")), plate), truth
 
 
-@pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize(("warmer", "told"), [(0.2, True), (1.0, True), (-1.0, True), (1.0, False)])
+@pytest.mark.parametrize(("warmer", "told", "sense"), [
+    (1.0, True, Sense.MICROSCOPE_MOVES), (-1.0, True, Sense.PLATE_MOVES),
+    (1.0, False, Sense.MICROSCOPE_MOVES)])
 def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
-    """20 stages; the scale is part of the map only if the temperature is known."""
+    """The scale is part of the map only if the temperature is known."""
     ratios, scales = [], []
-    for seed in range(20):
+    for seed in range(STAGES):
         result, truth = session(seed, warmer, told=told, sense=sense)
         emap = result.error_map
         modes = datum_modes(PLAN.artifact, scale=True)
@@ -70,7 +73,7 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
         assert (result.reference is not None) is told is is_traceable(result)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.12)
     changed = sum(p < 0.05 for p in scales)
-    assert changed <= 4 if told else changed == 20
+    assert changed <= binom.ppf(0.999, STAGES, 0.05) if told else changed == STAGES
 
 
 def test_what_was_converted_is_stated():

@@ -2,6 +2,7 @@
 """The cells of an image see one plate: its strain, bending and drift are those of the placing."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,21 +19,26 @@ from selfcal_ros.simulation.machine import Spread
 from test.support.collecting import START_NS, collect
 from test.support.options import BARE, bare
 from test.support.plans import image_plan, plan_of
-from test.support.truth import random_truth
+from test.support.truth import random_truth, simulate_measurements
 
 PLAN = image_plan(5, repeats=2)
+SETTINGS = CellSettings(sigma_xy_m=10e-9, servo_sigma_m=0.0)
 
 
-def measured(seed=1, plan=PLAN, strain=0.0):
-    """Return a machine and its readings; views are the cells of the images."""
+def machine(seed=1, plan=PLAN, strain=0.0):
+    """Return a machine whose plate is strained in each view, and what its noise is drawn from."""
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=1e-3))
     scale, stretch, shear = rng.normal(0, strain, (3, len(plan.views)))
-    truth = replace(truth, plate_strain=np.stack(
-        [scale + stretch, shear, shear, scale - stretch], axis=1).reshape(-1, 2, 2))
-    settings = CellSettings(sigma_xy_m=10e-9, servo_sigma_m=0.0)
-    return truth, collect(plan_events(truth, plan, settings=settings, rng=rng,
-                                      start_ns=START_NS))[0]
+    return replace(truth, plate_strain=np.stack(
+        [scale + stretch, shear, shear, scale - stretch], axis=1).reshape(-1, 2, 2)), rng
+
+
+@cache
+def measured(plan=PLAN, strain=0.0):
+    """Return the readings of a machine; views are the cells of the images."""
+    truth, rng = machine(plan=plan, strain=strain)
+    return collect(plan_events(truth, plan, settings=SETTINGS, rng=rng, start_ns=START_NS))[0]
 
 
 def columns_of(measurements, name, size):
@@ -50,7 +56,7 @@ def test_cells_belong_to_the_placing_of_their_view():
     ("plate_strain", 1e-6, 6), ("plate_strain", np.inf, 3),
     ("plate_shape", 1e-8, 12), ("drift", 1e-8, 8)])
 def test_a_placing_has_its_columns_in_all_cells(name, size, count):
-    ground, columns = columns_of(measured()[1], name, size)
+    ground, columns = columns_of(measured(), name, size)
     assert len(columns.columns) == count
     rows = {column.view for column in columns.columns}
     assert rows == ({0, 9} if np.isfinite(size) else {9})
@@ -62,7 +68,7 @@ def test_a_placing_has_its_columns_in_all_cells(name, size, count):
 
 def test_marks_of_one_image_have_one_time():
     """The first and the last exposure of the placing are its ends, not those of each cell."""
-    _, measurements = measured()
+    measurements = measured()
     ground, _ = columns_of(measurements, "drift", 1e-8)
     times = {}
     for row, visits in enumerate(ground.visits[:9]):
@@ -77,7 +83,8 @@ def test_u_holds_a_strain_that_all_cells_share():
     """Errors over u in 30 machines: six coefficients each, so that their rms scatters by 10 %."""
     term, z = ModelTerm("plate_strain", 1e-5), []
     for seed in range(30):
-        truth, measurements = measured(seed, strain=1e-5)
+        truth, rng = machine(seed, strain=1e-5)
+        measurements = simulate_measurements(truth, PLAN, rng, settings=SETTINGS)
         emap = calibrate(measurements, bare(terms=(term,), causes=False)).error_map
         error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g,
                              datum_modes(truth.artifact, scale=True))
@@ -86,7 +93,7 @@ def test_u_holds_a_strain_that_all_cells_share():
 
 
 def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing():
-    _, measurements = measured(strain=1e-5)
+    measurements = measured(strain=1e-5)
     found = validate(measurements, bare(terms=(ModelTerm("plate_strain", 1e-5),)))
     assert not [item for item in found if item.exceeds]
     assert max(item.ratio for item in found if np.isfinite(item.ratio)) < 2
@@ -95,7 +102,7 @@ def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing():
 def test_views_without_images_are_placings_of_their_own():
     plan = replace(plan_of("0, 90, tx", 5, count=0), views=tuple(
         replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views))
-    _, measurements = measured(plan=plan)
+    measurements = measured(plan)
     ground, columns = columns_of(measurements, "plate_strain", 1e-6)
     assert [column.view for column in columns.columns] == [0] * 3 + [1] * 3 + [2] * 3
     assert ground.members == {0: [0], 1: [1], 2: [2]}
