@@ -23,7 +23,7 @@ from test.support.truth import simulate_measurements
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
-COUNT = 8
+COUNT = 5
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
@@ -61,8 +61,9 @@ def test_on_the_lattice_the_map_is_that_of_the_lattice():
 def test_what_moves_turns_the_map():
     """The plate moves: G(X) = -H(-X), nodes and all."""
     found, _ = readings(plate(11, 7), SIX, np.random.default_rng(4))
-    stage = calibrate(found, BARE).error_map
-    moved = calibrate(replace(found, sense=Sense.PLATE_MOVES), BARE).error_map
+    plain = replace(BARE, causes=False)
+    stage = calibrate(found, plain).error_map
+    moved = calibrate(replace(found, sense=Sense.PLATE_MOVES), plain).error_map
     assert moved.gx == pytest.approx(-stage.gx[::-1, ::-1], abs=1e-18)
 
 
@@ -171,7 +172,7 @@ def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
 def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
     """What lies between the nodes goes into no term; a plate that is bent as well is found."""
     inside = []
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng([seed, 9])
         found, truth = readings(plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6,
                                 stage=waves(rng, 3))

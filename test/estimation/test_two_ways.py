@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality import validation
 from selfcal_ros.estimation.quality.outliers import clean, noisy_views, residuals_of
@@ -196,7 +197,7 @@ def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, mis
         replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
         for view in readings.views))
     quick = replace(options, uncertainty=False, causes=False)
-    answers = responses(lambda moved: numbers_of(calibrate(moved, quick)), readings,
+    answers = responses(lambda moved: numbers_of(solve_joint(moved, quick).result), readings,
                         sizes_of(readings, SIGMA_M, SIGMA_RAD))
     found = maps_of(calibrate(readings, options))
     u = np.concatenate([found["u_" + key].ravel() for key in ("gx", "gy", "g_theta")])
@@ -217,7 +218,8 @@ def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, s
     wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}
     for _ in range(30):
         draw = rng.normal(size=len(values_of(clean))) * sizes_of(clean, SIGMA_M, SIGMA_RAD)
-        found = maps_of(calibrate(with_values(clean, values_of(clean) + draw), options))
+        moved = with_values(clean, values_of(clean) + draw)
+        found = maps_of(solve_joint(moved, options).result)
         for key, kind in (("gx", "xy"), ("gy", "xy"), ("g_theta", "theta")):
             z = (found[key] - wanted[key]) / found["u_" + key]
             squares[kind].append(z[np.isfinite(z)] ** 2)

@@ -169,11 +169,11 @@ def solved(seed, truth=None):
 
 
 def test_uncertainties_are_the_scatter_of_repeated_calibrations():
-    """40 calibrations: a standard deviation is known to 11 %, and lengths have no bias."""
+    """20 calibrations: a standard deviation is known to 16 %, and lengths have no bias."""
     truth, _ = solved(0)
     exact = StageMap(result_of(replace(random_map(ARTIFACT, 1), gx=truth.g[0], gy=truth.g[1])))
     z = {"difference": [], "G": [], "Fmax": [], "Fmin": [], "M": [], "1 M": [], "2 M": []}
-    for seed in range(40):
+    for seed in range(20):
         stage = StageMap(solved(seed, truth)[1])
         stage.halfway = np.zeros((2, 2))  # the truth is bilinear between its nodes
         for name, of in (("difference", lambda s: diagonal_figures(s)[2].figures["length"]),
@@ -310,8 +310,8 @@ def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monk
     assert "without repeats" in both.out
 
 
-@pytest.mark.parametrize(("reversal_m", "spread_m"), [(0.0, 0.0), (1e-7, 0.0), (5e-8, 5e-8)])
-@pytest.mark.parametrize("unlike", [False, True])
+@pytest.mark.parametrize(("reversal_m", "spread_m", "unlike"), [
+    (0.0, 0.0, True), (1e-7, 0.0, True), (5e-8, 5e-8, False)])
 def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_m, unlike):
     """150 machines with known reversal and scatter, five approaches from each side.
 
