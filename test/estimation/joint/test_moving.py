@@ -44,9 +44,9 @@ def off(truth, result):
         [emap.u_gx, emap.u_gy])
 
 
-def maps_of(machines, **how):
+def maps_of(machines, *, size=11, **how):
     """Return the maps of machines in both senses: which qualify, which hold, error over u."""
-    plan, qualified, holds, errors = hu_plan(Artifact(11, 0.01, 24), 5), [], [], []
+    plan, qualified, holds, errors = hu_plan(Artifact(size, 0.01, 24), 5), [], [], []
     for seed in range(machines):
         truth, readings = measured(plan, seed, sense=tuple(Sense)[seed % 2], **FOLLOWS, **how)
         result = calibrate(readings, bare())
@@ -63,22 +63,22 @@ def test_plates_a_tenth_of_a_pitch_beside_cost_nothing():
 
 
 def test_plates_two_tenths_beside_are_held_as_well():
-    qualified, holds, z = maps_of(10, t_m=2e-3)
-    assert qualified.sum() >= 9 and holds.all()
+    qualified, holds, z = maps_of(6, t_m=2e-3)
+    assert qualified.sum() >= 5 and holds.all()
     assert z <= 1.05
 
 
 def test_a_stage_too_rough_for_it_is_rather_not_qualified_than_wrong():
-    qualified, holds, _ = maps_of(20, t_m=2e-3, length=2.0)
+    qualified, holds, _ = maps_of(8, size=9, t_m=2e-3, length=2.0)
     assert (~qualified).sum() > (qualified & ~holds).sum()
-    assert holds.sum() >= 19
+    assert holds.sum() >= 7
 
 
 @pytest.mark.parametrize("sense", Sense)
 def test_taking_the_sites_for_the_places_makes_errors_larger_than_u(sense):
     errors = []
     for seed in range(6):
-        truth, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), seed, sense=sense,
+        truth, readings = measured(hu_plan(Artifact(9, 0.01, 24), 5), seed, sense=sense,
                                    **FOLLOWS)
         errors.append(off(truth, calibrate(readings, bare(at_places=False, causes=False))))
     assert np.sqrt(np.mean(np.square(errors))) > 1.05
@@ -98,11 +98,10 @@ def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(m
 
 
 def test_a_stage_that_is_white_there_is_not_qualified():
-    for seed in range(3):
-        _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), seed, length=0.0, **FOLLOWS)
-        verdict = calibrate(readings, bare()).verdict
-        assert not verdict.qualified
-        assert "off_sites" in [cause.name for cause in verdict.causes]
+    _, readings = measured(hu_plan(Artifact(7, 0.01, 24), 5), length=0.0, **FOLLOWS)
+    verdict = calibrate(readings, bare()).verdict
+    assert not verdict.qualified
+    assert "off_sites" in [cause.name for cause in verdict.causes]
 
 
 def test_micrometres_off_the_sites_are_nothing():
