@@ -26,7 +26,6 @@ from itertools import product
 from math import ceil
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.sparse import csr_matrix
 
 from selfcal_ros.estimation.lattice.readings import AnyPose, MapPose
@@ -238,6 +237,8 @@ class Axis:
 
         Places beyond the edge, which rounding moves there, count as on it.
         """
+        from scipy.interpolate import BSpline  # a tenth of a second, for marks off the sites alone
+
         knots, k = self.knots, self.degree
         at = np.clip(at, knots[0], knots[-1])
         cell = np.clip(np.searchsorted(knots, at, "right") - 1, k, len(knots) - k - 2)

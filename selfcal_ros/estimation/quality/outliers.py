@@ -32,7 +32,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.special import chdtri, fdtrc, gammaincinv
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
@@ -223,6 +222,8 @@ def view_noise(residuals: Residuals) -> np.ndarray:
     -------
     float array (views, 3)
     """
+    from scipy.optimize import nnls  # a tenth of a second, for this alone
+
     system, grid = residuals.problem.system, residuals.problem.system.grid
     mixing = _mixings.get(system, None, lambda: _mixing(system))
     sums = (abs(residuals.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
