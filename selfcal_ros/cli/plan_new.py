@@ -18,8 +18,10 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.observability.plan_check import (
     CHECK_MARKS,
     CHECK_OFFSET_M,
+    candidate_views,
     check_plan,
     describe_view,
+    measured_like,
     predict_plan,
 )
 from selfcal_ros.estimation.observability.resistance import PlanBudget, plan_budget
@@ -273,11 +275,13 @@ def _image(known: Known) -> Image | None:
 
 def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
     """Return the plan of the smallest uncertainty that the time allows."""
-    image = _image(known)
-    plans = []
+    like = View("", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact),
+                image=_image(known))
+    fewest = _fewest_exposures(artifact, like)
+    plans: list[Plan] = []
     for n_views in range(3, MOST_VIEWS + 1):
-        like = View("", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact),
-                    image=image)
+        if plans and _minutes(known, n_views, n_views * fewest) > known.minutes:
+            break  # without the search that takes longest
         views = best_plan(artifact, n_views + bool(known.lines), angular=bool(known.lines),
                           like=like, against=_against())[0].views
         plans += list(_repeated(Plan(name, artifact, views)))
@@ -291,6 +295,12 @@ def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None])
                          f"{_counted_visits(plans[0], known)}",
                          "give more minutes, fewer marks, or fewer seconds for a mark")
     return min(fitting, key=_u_of_reading)
+
+
+def _fewest_exposures(artifact: Artifact, like: View) -> int:
+    """Return the exposures of the shortest view that can be chosen, measured once."""
+    return min(_exposures(Plan("", artifact, (measured_like(view, like),)))
+               for view in candidate_views(artifact, angular=False))
 
 
 def _repeated(plan: Plan) -> Iterator[Plan]:
@@ -317,8 +327,11 @@ def _exposures(plan: Plan) -> int:
 
 def minutes_of(known: Known, plan: Plan) -> float:
     """Return the minutes that a plan takes."""
-    return (len(plan.views) * PLACING_MIN[known.placing]
-            + _exposures(plan) * known.seconds / 60)
+    return _minutes(known, len(plan.views), _exposures(plan))
+
+
+def _minutes(known: Known, placings: int, exposures: int) -> float:
+    return placings * PLACING_MIN[known.placing] + exposures * known.seconds / 60
 
 
 def _counted_visits(plan: Plan, known: Known) -> str:
