@@ -164,7 +164,7 @@ def read_cell(path: str | Path) -> Cell:
                          f"{', '.join(known_machines())}, or package.module:Class")
     machine = data["machine"]
     own = machine.rpartition(":")[2]
-    if ":" not in machine and machine not in known_machines():
+    if ":" not in machine and machine not in SHIPPED and machine not in known_machines():
         raise InputError(f"{where}: machine", f"there is no machine '{machine}'",
                          f"{known_are(machine, sorted(known_machines()))}; or "
                          "package.module:Class")
@@ -285,7 +285,8 @@ def connected(cell: Cell, say: Callable[[str], None]) -> Iterator[Machine]:
 
 def class_of(cell: Cell) -> Any:
     """Return the class of a cell's machine; raises InputError like `open_machine`."""
-    target = cell.machine if ":" in cell.machine else known_machines()[cell.machine]
+    target = cell.machine if ":" in cell.machine else (
+        SHIPPED.get(cell.machine) or known_machines()[cell.machine])
     where = f"{cell.path}: machine"
     module, _, name = target.partition(":")
     folder = str(cell.path.resolve().parent)
