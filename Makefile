@@ -7,7 +7,7 @@ QUICK := test/shipped/test_bags.py test/shipped/test_configs.py test/cli/test_mi
 	test/cli/test_arguments.py test/cli/test_solve.py test/cli/test_apply.py test/sessions test/reporting/test_html.py \
 	test/test_house.py test/test_portable.py
 
-.PHONY: help setup demo quick test test-313 test-oldest lint ament-lint mistakes bench soak chaos power-cuts mutants reality \
+.PHONY: help setup demo quick test tests test-313 test-oldest lint ament-lint mistakes bench soak chaos power-cuts mutants reality \
 	pictures docs map3d reference sbom clean
 help:  ## this list
 	@awk -F ':.*  ## ' '/^[a-z0-9-]+:.*  ## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,7 +37,8 @@ build/machines/.complete: tools/machine-requirements.txt | setup
 		--upgrade --target build/machines -r $< && touch $@ || echo "test: pymmcore and pyserial are left out: they cannot be installed"
 build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
 	@$(BIN)/python $< $(@D) || true
-test: lint ament-lint build/oracles/.complete build/oracles/dcc/dcc.xsd build/machines/.complete  ## everything: linters and all tests, ten minutes
+test: lint ament-lint tests  ## everything: linters and all tests, ten minutes
+tests: build/oracles/.complete build/oracles/dcc/dcc.xsd build/machines/.complete  ## all tests, without the linters
 	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles:$(CURDIR)/build/machines$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
 quick: setup  ## two minutes: the tests that reach most of the code
 	@$(BIN)/python -m pytest -q -n 2 -m "not ros" $(QUICK)
