@@ -16,7 +16,7 @@ from hypothesis import given, settings, strategies
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_libraries, "1")
 
-settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell: children too
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -454,7 +454,7 @@ def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(t
                                  "file that `selfcal` wrote")
 
 
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False,
        allow_infinity=False) | st.text(), lambda inner: st.lists(inner) | st.dictionaries(
            st.text(), inner), max_leaves=20))

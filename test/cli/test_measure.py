@@ -38,13 +38,13 @@ def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, caps
 def test_a_run_that_is_killed_is_resumed_to_the_same_map(tmp_path):
     """Killed in a move, with half of a message written, and before its first file is whole."""
     whole = tmp_path / "whole"
-    prepare(whole)
+    prepare(whole, marks=3)
     assert measured(whole).returncode == 0
     for number, cut in enumerate([
-            Cut("in a move", 70), Cut("half of a message written", 300),
+            Cut("in a move", 50), Cut("half of a message written", 150),
             Cut("before a file is on the disk", 1)]):
         folder = tmp_path / str(number)
-        prepare(folder)
+        prepare(folder, marks=3)
         assert measured(folder, cut).returncode == -signal.SIGKILL
         kept = detections(folder)
         assert bool(kept) is (cut.number > 1)

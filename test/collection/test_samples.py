@@ -32,7 +32,7 @@ def stored(parts, *, speeds):
     return store, sorted(every)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(STAMPS, max_size=12), st.integers(-5, 305), st.integers(0, 100),
        st.integers(1, 6), st.booleans())
 def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, beside, speeds):

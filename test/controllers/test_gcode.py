@@ -213,7 +213,7 @@ LINES = st.builds(
     st.sampled_from(["", "", "; X9", "(G91)"]))
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(st.sampled_from(sorted(DIALECTS)), st.lists(LINES, min_size=1, max_size=8), st.booleans())
 def test_no_random_program_leads_the_stage_elsewhere(dialect, lines, said):
     """Of a program its lines that are not refused after one another."""

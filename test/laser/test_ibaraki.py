@@ -24,7 +24,7 @@ UM = 1e-6
 angles = st.floats(-2e-3, 2e-3)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(2e-3, 0.05), st.floats(2e-3, 0.05),
        st.integers(1, 8), st.tuples(angles, angles))
 def test_exact_form_recovers_the_truth_for_any_steps_and_mirrors(seed, a, b, n, mirrors):

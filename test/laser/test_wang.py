@@ -41,7 +41,7 @@ def test_table_1_of_the_source(case):
                                atol=0.5 * 10.0**-decimals)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
 def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
     errors = random_errors(n, np.random.default_rng(seed))

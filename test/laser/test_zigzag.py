@@ -195,7 +195,7 @@ def rests_by_trying_every_start(series, rule):
     return found
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(1e-8, 3e-7), st.integers(2, 40))
 def test_rests_of_creeping_axes_are_those_of_the_definition(seed, creep, jumps):
     rng = np.random.default_rng(seed)

@@ -69,7 +69,7 @@ states = st.tuples(st.lists(texts, max_size=4), numbers, numbers, numbers, texts
                    st.binary(max_size=9))
 
 
-@settings(deadline=None, max_examples=70)
+@settings(deadline=None, max_examples=30)
 @given(st.lists(states, min_size=1, max_size=30))
 def test_any_mixture_of_layouts_gives_what_rosbags_gives(drawn):
     data, expected = [], []

@@ -196,7 +196,7 @@ def readings(draw):
         draw(FLOATS), draw(U32), draw(U32), draw(U32), draw(COUNTS))
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(read=readings(), artifact=ARTIFACTS, rejected=COUNTS, sense=st.sampled_from(Sense))
 def test_view_measurements_come_back(read, artifact, rejected, sense):
     progress = ViewProgress(5, read.view, 0, 0, 0, 0, read, 0)

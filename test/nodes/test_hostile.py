@@ -50,7 +50,7 @@ from test.support.sessions import cdr_of, collected, events_of, plan_file, small
 
 PLAN = small_plan("0, 90, tx", repeats=1)
 TEXT_FIELDS = ("stamp.sec", "nanosec", "_id", "view_name", "reasons", "_terms", "_counts",
-               "missing_m", "stamp", "approach_x", "approach_y")
+               "missing_m", "stamp", "approach_x", "approach_y", "session_notes")
 HEARD_BY = {EncoderSample: (names.ENCODER, 3), Detection: (names.DETECTIONS, 2),
             Command: (names.COMMAND, 5)}
 """How many of the nodes hear what a cell says."""

@@ -6,11 +6,10 @@ The plate stays where it lay, as in a power cut; the process begins anew.
 
 import contextlib
 import json
+import multiprocessing
 import os
 import random
 import signal
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,8 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.topics import DETECTION_TOPIC
 from test.support.cells import PLAN, SIMULATION
 
-ROOT = Path(__file__).parents[2]
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["selfcal_ros.cli.measure", "selfcal_ros.machine.simulated"])
 CELL = """
 machine: surviving_stage:SurvivingStage
 SurvivingStage: {}
@@ -66,20 +66,28 @@ class Cut(NamedTuple):
     number: int
 
 
-def prepare(folder: Path) -> None:
-    """Write plan, machine and simulation into a new folder."""
+class Ended(NamedTuple):
+    """How a run has ended, and what it said."""
+
+    returncode: int
+    stderr: str
+
+
+def prepare(folder: Path, marks: int = 5) -> None:
+    """Write the plan of so many marks a side, machine and simulation into a new folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("plan.yaml", PLAN.replace("grid_size: 3", "grid_size: 5")),
+    for name, text in (("plan.yaml", PLAN.replace("grid_size: 3", f"grid_size: {marks}")),
                        ("sim.yaml", SIMULATION), ("cell.yaml", CELL),
                        ("surviving_stage.py", STAGE)):
         (folder / name).write_text(text)
 
 
-def measured(folder: Path, cut: Cut | None = None) -> subprocess.CompletedProcess:
+def measured(folder: Path, cut: Cut | None = None) -> Ended:
     """Run ``selfcal measure --resume`` in a process of its own, killed at a cut."""
-    words = [cut.point, str(cut.number)] if cut else ["", "0"]
-    return subprocess.run([sys.executable, "-m", "test.support.power_cuts", str(folder), *words],
-                          cwd=ROOT, check=False, capture_output=True, text=True)
+    process = PROCESSES.Process(target=main, args=(folder, cut))
+    process.start()
+    process.join()
+    return Ended(process.exitcode, Path(folder, "said.txt").read_text())
 
 
 def passages(folder: Path) -> dict[str, int]:
@@ -130,8 +138,8 @@ def outcome(folder: Path, whole: Path, before: list[bytes]) -> Outcome:
                    bool(result["verdict"]["qualified"]))
 
 
-def main(folder: str, point: str, number: str) -> int:
-    """Run ``selfcal measure`` here; kill this process at a point, or count all passages."""
+def main(folder: Path, cut: Cut | None) -> None:
+    """Run ``selfcal measure`` here; kill this process at a cut, or count all passages."""
     from selfcal_ros.cli.main import main as selfcal
     from selfcal_ros.machine.simulated import SimulatedMachine
 
@@ -139,7 +147,7 @@ def main(folder: str, point: str, number: str) -> int:
 
     def is_due(here: str) -> bool:
         passed[here] += 1
-        return here == point and passed[here] == int(number)
+        return cut == (here, passed[here])
 
     def kill() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -168,12 +176,8 @@ def main(folder: str, point: str, number: str) -> int:
     cut_before(SimulatedMachine, "offsets", "in an exposure")
     cut_before(os, "fsync", "before a file is on the disk")
     cut_before(Path, "replace", "before a file has its name")
-    place = Path(folder)
-    with contextlib.chdir(place):
+    with (contextlib.chdir(folder), Path("said.txt").open("w") as said,
+          contextlib.redirect_stdout(said), contextlib.redirect_stderr(said)):
         code = selfcal(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"])
         Path("passages.json").write_text(json.dumps(passed))
-    return code
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    raise SystemExit(code)

@@ -277,7 +277,7 @@ def test_truth_recovery_in_units_of_the_uncertainty():
 
 
 @given(st.tuples(*[st.floats(-1e-5, 1e-5)] * 5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_datum_difference_does_not_change_the_comparison(shift):
     result, truth = known_result(7, 8)
     artifact = result.artifact
