@@ -125,7 +125,7 @@ def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
 
 
 @pytest.mark.parametrize("fault", [
-    "connection lost in a move", "frozen position", "zero lost at rest", "black", "out of focus"])
+    "connection lost in a move", "zero lost at rest", "out of focus"])
 def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, fault):
     cell, machine = write_cell(tmp_path, camera=True)
     with pytest.raises((MachineError, NoDataError)):
