@@ -14,8 +14,6 @@ from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
-from scipy.stats import false_discovery_control
 
 from selfcal_ros.batch.folder import Record
 from selfcal_ros.errors import InputError
@@ -87,6 +85,8 @@ def course_of(days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *,
                      float(values[0]))
     if len(values) < FEWEST or np.ptp(values) == 0 or np.ptp(days) == 0:
         return nothing
+    from scipy import stats  # a second, for a series alone
+
     slope, _, low, high = stats.theilslopes(values, days, 0.95)
     change, p_change = step_of(values), pettitt(values, rng, orders=orders)
     return Course(len(values), (float(slope), float(low), float(high)),
@@ -100,7 +100,9 @@ def pettitt(values: np.ndarray, rng: np.random.Generator, *,
 
     Pettitt's statistic is the largest |2 sum of the first t ranks - t (n + 1)| over t.
     """
-    ranks = stats.rankdata(values)
+    from scipy.stats import rankdata  # as in `course_of`
+
+    ranks = rankdata(values)
     size = _imbalance(ranks[None]).max()
     shuffled = rng.permuted(np.broadcast_to(ranks, (orders, len(ranks))), axis=1)
     as_large = int((_imbalance(shuffled).max(axis=1) >= size - 1e-9).sum())
@@ -146,14 +148,18 @@ def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SE
                 course = replace(course, last_before=int(last), change=int(first))
             found[name] = course
     adjusted = _adjusted([p for course in found.values()
-                          for p in (course.p_trend, course.p_change)])
+                          for p in (course.p_trend, course.p_change)]).reshape(-1, 2)
     return {name: _judged(course, pair, days, table[name]) for (name, course), pair in
             zip(found.items(), adjusted, strict=True)}
 
 
 def _adjusted(p: Sequence[float]) -> np.ndarray:
-    """Return the probabilities of all tests of a batch, corrected together, (n, 2)."""
-    return stats.false_discovery_control(p).reshape(-1, 2) if p else np.zeros((0, 2))
+    """Return the probabilities of all tests of a batch, corrected together, (n,)."""
+    if not p:
+        return np.zeros(0)
+    from scipy.stats import false_discovery_control  # as in `course_of`
+
+    return false_discovery_control(p)
 
 
 def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
@@ -213,7 +219,7 @@ def compared(records: Sequence[Record], folder: Path, baseline: CalibrationResul
                for number, record in enumerate(records)]
     p = {number: value for number, difference in found.items()
          if np.isfinite(value := probability(difference))}
-    adjusted = dict(zip(p, false_discovery_control(list(p.values())), strict=True)) if p else {}
+    adjusted = dict(zip(p, _adjusted(list(p.values())), strict=True))
     return [record if number not in found else record | {
         "quantities": record["quantities"] | _quantities(found[number]),
         "baseline": None if number not in p else {
