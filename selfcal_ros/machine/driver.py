@@ -53,7 +53,7 @@ class Driver:
         self._unplaced = False  # the robot has failed, or was stopped
         self._placing = False  # a robot may be at it: MEASURE waits for its end
         self._turn = threading.Condition()  # guards the three below
-        self._next: Job | None = None
+        self._jobs: deque[Job] = deque()
         self._busy = self._ending = False
         self._thread = threading.Thread(target=self._work, name="machine", daemon=True)
         self._thread.start()
@@ -62,7 +62,7 @@ class Driver:
     def busy(self) -> bool:
         """Whether it is placing or visiting."""
         with self._turn:
-            return self._busy or self._next is not None
+            return self._busy or bool(self._jobs)
 
     def take_command(self, command: Command) -> None:
         """Carry out a new command.
@@ -82,9 +82,13 @@ class Driver:
             job = partial(self._measure, command, None)
         with self._turn:
             is_placed = self._placing and command.phase == Phase.MEASURE
+            if not is_placed:
+                self._jobs.clear()
             if self._busy and not is_placed:
                 self._visitor.stop()
-            self._next, self._placing = job, command.phase == Phase.PLACE
+            if job is not None:
+                self._jobs.append(job)
+            self._placing = command.phase == Phase.PLACE
             self._turn.notify()
 
     def take_status(self, status: Any) -> None:
@@ -95,14 +99,15 @@ class Driver:
         command = self._duty.command
         if again and command is not None:
             with self._turn:
-                self._next = self._next or partial(self._measure, command, again)
+                if not self._jobs:
+                    self._jobs.append(partial(self._measure, command, again))
                 self._turn.notify()
 
     def _work(self) -> None:
         while not self._ending:
             with self._turn:
-                self._turn.wait_for(lambda: self._next is not None or self._ending, IDLE_S)
-                job, self._next = self._next, None
+                self._turn.wait_for(lambda: self._jobs or self._ending, IDLE_S)
+                job = self._jobs.popleft() if self._jobs else None
                 self._busy, self._visitor.stopped = job is not None, False
             if job is None:
                 self._guard(self._look)
@@ -152,7 +157,8 @@ class Driver:
     def close(self) -> None:
         """Stop, and release the machine."""
         with self._turn:
-            self._next, self._ending = None, True
+            self._jobs.clear()
+            self._ending = True
             self._visitor.stop()
             self._turn.notify()
         self._thread.join(self._cell.settle.patience)

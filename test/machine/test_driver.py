@@ -28,10 +28,13 @@ def cell(tmp_path):
     driver = Driver(found, machine, said.append, Jumping())
     stamps = iter(range(START_NS, START_NS + 100))
 
-    def command(phase: Phase) -> None:
-        driver.take_command(Command(next(stamps), phase, plan.plan_id, view=plan.views[0],
-                                    artifact=plan.artifact, views_planned=len(plan.views)))
-        wait_until(lambda: not driver.busy, f"the end of {phase.name}")
+    def command(*phases: Phase) -> None:
+        with driver._turn:  # its thread takes none of them up before the last
+            for phase in phases:
+                driver.take_command(Command(
+                    next(stamps), phase, plan.plan_id, view=plan.views[0],
+                    artifact=plan.artifact, views_planned=len(plan.views)))
+        wait_until(lambda: not driver.busy, f"the end of {phases}")
     yield driver, said, machine, command
     driver.close()
 
@@ -53,6 +56,15 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
     command(Phase.MEASURE)
     seen = {(event.m, event.n) for event in driver.events if isinstance(event, Detection)}
     assert len(seen) == 9
+
+
+def test_a_plate_is_placed_though_the_command_to_measure_follows_at_once(cell):
+    driver, said, machine, command = cell
+    place, placed = machine.place, []
+    machine.place = lambda placing: (placed.append(placing.view), place(placing))
+    command(Phase.PLACE, Phase.MEASURE)
+    assert placed == ["identity"] and not said
+    assert any(isinstance(event, Detection) for event in driver.events)
 
 
 def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
