@@ -116,8 +116,6 @@ RESULT = {
     "digest": "key -> the first 64 bits of the SHA-256 of its value, without the time of creation: "
               "a key that was edited is refused by name, a file without `digest` too; one of a "
               "version before 0.4.0, which wrote none, is not qualified",
-    "excluded": "effects outside U, as lines of `budget` with the source `excluded`: `u` is a "
-                "nominal size, `effect_rms`, `effect_max` what it would add to u of the XY map",
     "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "
               "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
               "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "

@@ -113,7 +113,8 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
         if alone is not None and seen.identifiable:
             terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
-            budget = plan_budget(plan, terms, assumed, alone, asked=[term.name for term in model])
+            budget = plan_budget(plan, terms, assumed, alone,
+                                 asked=[term.name for term in declared])
     if args.json:
         found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M

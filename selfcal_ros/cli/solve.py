@@ -47,7 +47,7 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.phrases import excluded_text, recheck_lines
+from selfcal_ros.reporting.words.phrases import recheck_lines
 from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
 
 
@@ -272,5 +272,4 @@ def _budget(result: Any) -> list[str]:
     """Return the text of the budget."""
     if not result.has_uncertainty:
         return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
-    return ["", *budget_text(budgets(result)),
-            *(f"not in U: {excluded_text(line)}" for line in result.excluded)]
+    return ["", *budget_text(budgets(result))]

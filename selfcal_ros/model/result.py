@@ -178,7 +178,6 @@ class CalibrationResult:
     """The result of a calibration.
 
     `recheck` is what views of a known plate show to have changed; None of a calibration.
-    `excluded` are effects outside the model, with what they would add to u at a nominal size.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the
     name of the file and its SHA-256, of a result that was read from one.
@@ -203,7 +202,6 @@ class CalibrationResult:
     run_id: str = ""
     findings: tuple[Finding, ...] = ()
     budget: tuple[BudgetLine, ...] = ()
-    excluded: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
     recheck: Recheck | None = None
     read_from: tuple[str, str] | None = None
@@ -314,7 +312,6 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "findings": plain([finding_to_dict(found) for found in result.findings]),
         "budget": plain([line_to_dict(line) for line in result.budget]),
-        "excluded": plain([line_to_dict(line) for line in result.excluded]),
         "input": dict(result.input),
         **({} if result.recheck is None else {"recheck": result.recheck.to_dict()}),
         **{key: plain(value) for key, value in result.extra.items()},
@@ -429,7 +426,6 @@ def _parse(data: dict) -> CalibrationResult:
         provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
         findings_from_list(Finding, data.get("findings", [])),
         budget_from_list(data.get("budget", [])),
-        budget_from_list(data.get("excluded", [])),
         artifact if artifact.map_grid else None,
         read(Recheck | None, data.get("recheck")))
 

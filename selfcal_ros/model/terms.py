@@ -16,6 +16,10 @@ MAX_DRIFT_DEGREE = 9
 DRIFT_DEGREE = 3
 """Default degree of this polynomial."""
 
+UNTOLD = 0.3
+"""Effect in standard uncertainties of the map, rms, from which a term that the readings do not
+determine is assumed in its nominal size."""
+
 SMALLEST, LARGEST = 1e-18, 1.0
 """Valid sizes of terms in texts."""
 
@@ -88,6 +92,16 @@ def default_of(block: Block) -> ModelTerm:
     if block.parts:
         return ModelTerm(block.name, parts=block.sizes)
     return ModelTerm(block.name, max(block.sizes))
+
+
+def nominal_terms(known: Collection[str], *, visits: bool) -> list[ModelTerm]:
+    """Return terms that are not assumed by default, except those `known`, in nominal sizes.
+
+    `visits`: whether the visits of all views are known, as some terms require.
+    """
+    return [ModelTerm(block.name, block.nominal) for block in blocks().values()
+            if block.nominal and not (block.sizes or block.part_of or block.name in known)
+            and (visits or not block.needs_visits)]
 
 
 @cache

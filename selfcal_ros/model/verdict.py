@@ -153,8 +153,7 @@ class BudgetLine:
     dof : float
         Degrees of freedom; infinite if known.
     source : str
-        What gives `u`: ``readings``, or what was ``declared`` or is assumed by ``default``;
-        ``excluded`` if U does not contain it: `u` is then nominal.
+        What gives `u`: ``readings``, or what was ``declared`` or is assumed by ``default``.
     details : dict
         How it was found, by name.
     text : str

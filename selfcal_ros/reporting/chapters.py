@@ -44,7 +44,7 @@ from selfcal_ros.reporting.summary.numbers import (
 )
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.reporting.words.findings import advice, unit_of, what_it_is
-from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
+from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 MAX_MARKS = 51 * 51
@@ -358,9 +358,7 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
     header = ("known", "u rms", "u largest", "U rms", "U largest", "unit", "k",
               "degrees of freedom")
     return Chapter("Uncertainty", sections=(Section(
-        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables,
-        Section("Not in U", notes=tuple(
-            printable(excluded_text(line)) for line in result.excluded))))
+        "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)), *tables))
 
 
 def _budget_table(budget: Budget, unit: str, scale: float) -> Section:

@@ -16,7 +16,7 @@ from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import COMBINED, CalibrationResult
 from selfcal_ros.reporting.chapters import convention_section, said
-from selfcal_ros.reporting.words.phrases import dof_text, excluded_text, line_text
+from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
 from selfcal_ros.standards.details import UNITS
 from selfcal_ros.standards.statements import (
@@ -244,8 +244,6 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
         if np.isfinite(k := getattr(noise, f"k_{kind}")):
             yield f"coverage of {name}", (f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))}"
                                           " degrees of freedom")
-    for line in result.excluded:
-        yield "outside the uncertainty", excluded_text(line)
     for warning in result.warnings:
         yield "warning", warning
 

@@ -155,7 +155,8 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     found = json.loads(capsys.readouterr().out)["budget"]
     assert (found["sigma_m"], found["sigma_rad"]) == (20e-9, pytest.approx(math.radians(1e-3)))
     lines = {line["component"]: line for line in found["lines"]}
-    assert list(lines) == ["reading noise", "microscope", "plate_shape", "plate_strain"]
+    assert list(lines) == ["reading noise", "microscope", "plate_shape", "plate_strain", "drift"]
+    assert lines["drift"]["removal"]["text"].startswith("visit the marks in the order ")
     assert lines["plate_shape"]["removal"]["text"].startswith(
         "add an unturned view shifted by -1 pitch along X")
     microscope = lines["microscope"]

@@ -13,7 +13,7 @@ determine of a term with a size stays in U (GUM type B). What removes it is foun
 stops, another visiting order, a further view.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -51,7 +51,7 @@ from selfcal_ros.estimation.terms.planned import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.model.terms import UNTOLD, ModelTerm, nominal_terms
 from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 
@@ -344,11 +344,22 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
     alone : Prediction
         Uncertainty without terms, from `predict_plan`.
     asked : iterable of str
-        The terms that somebody declared; the others are defaults.
+        The terms that somebody declared, also to be zero; the others are defaults.
     """
     if plan.artifact.shape[0] * plan.artifact.shape[1] > MAX_SITES:
         plan = smaller(plan, PROXY_SIZE)
-    declared, n = set(asked), unit_repeats(plan)
+    asked = set(asked)
+    budget = _budget(plan, terms, assumed, alone, asked=asked)
+    if more := _untold(budget, plan, terms, assumed, asked=asked):
+        terms = [*terms, *more]
+        budget = _budget(plan, terms, assumed, alone, asked=asked)
+    return replace(budget, removals=_removals(budget, plan, terms, assumed))
+
+
+def _budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, alone: Prediction, *,
+            asked: Collection[str]) -> PlanBudget:
+    """Return the lines of the budget."""
+    n = unit_repeats(plan)
     effects = effects_of_terms(plan, terms, assumed) if terms else {}
     free = effects.pop(FREE, None)
     lines = []
@@ -363,11 +374,20 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
         for term in terms:
             effect = effects[term.name][at][known] if term.name in effects else np.zeros(1)
             if effect.mean() > NEGLIGIBLE * noise.mean():
-                source = "declared" if term.name in declared else "default"
+                source = "declared" if term.name in asked else "default"
                 lines.append(_line(quantity, str(term.name), effect, u=term.size,
                                    unit=term.block.unit, source=source))
-    budget = PlanBudget(tuple(lines), {})
-    return replace(budget, removals=_removals(budget, plan, terms, assumed))
+    return PlanBudget(tuple(lines), {})
+
+
+def _untold(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, *,
+            asked: Iterable[str]) -> list[ModelTerm]:
+    """Return the terms that readings of the plan will not determine: they will be assumed."""
+    more = nominal_terms({*asked, *(term.name for term in terms)}, visits=True)
+    effects = effects_of_terms(plan, [*terms, *more], assumed) if terms and more else {}
+    least = (UNTOLD * budget.u_rms("xy")) ** 2
+    return [term for term in more
+            if term.name in effects and effects[term.name][0].mean() > least]
 
 
 def _line(quantity: str, component: str, variance: np.ndarray, *, u: float, unit: str,

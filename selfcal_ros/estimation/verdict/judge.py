@@ -22,17 +22,15 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
 from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
-from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, is_untested
+from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested
 from selfcal_ros.estimation.joint.problem import NoiseEstimate
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL, LEAST_NOISE_M, TermEquations
+from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
-    is_searched,
     search_causes,
 )
 from selfcal_ros.estimation.verdict.uncertainty import (
@@ -43,12 +41,9 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
     with_coverage,
 )
-from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
-from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Provenance, Verdict
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
 MUCH_MORE = 1.1
@@ -136,8 +131,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
                   *_left_out_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
-    return replace(solved, result=replace(result, budget=tuple(budget_lines(result)),
-                                          excluded=_excluded(solved, result, options)))
+    return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
 
 
 def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
@@ -182,17 +176,6 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     largest = noise.residuals**2 * squares / squares.sum() * noise.dof_residuals / chdtri(
         dof, 1 - DOUBT_LEVEL)
     return float(np.sqrt(max(largest.max() - noise.known**2, 0.0) / each[each > 0].mean()))
-
-
-def _excluded(solved: Solved, result: CalibrationResult,
-              options: Options) -> tuple[BudgetLine, ...]:
-    """Return the effects outside U, in fields of which causes are always searched for."""
-    model, emap = solved.model, result.error_map
-    if model is None or not result.has_uncertainty or not np.isfinite(model.found.xy.sigma):
-        return ()
-    if not is_searched(emap.gx.size, options, failed=False):
-        return ()
-    return excluded_lines(model, options, rms(np.stack([emap.u_gx, emap.u_gy])))
 
 
 def _unexplained_noise(solved: Solved) -> bool:
@@ -356,62 +339,3 @@ def _iso(stamp_ns: int) -> str:
         return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
     except (OverflowError, ValueError, OSError):
         return f"{stamp_ns} ns"
-
-
-MATTERS = 0.3
-"""Effect in standard uncertainties of the map, rms, below which it is not stated."""
-
-
-def excluded_lines(model: ModelFit, options: Options, u_rms: float) -> tuple[BudgetLine, ...]:
-    """Return what terms outside the model would add to u of the XY map, the largest first.
-
-    Of each the increase of u² if it alone were declared with its nominal size: what the readings
-    determine of it is not part of that.
-
-    Parameters
-    ----------
-    model : ModelFit
-        The fit.
-    options : Options
-        Terms that are declared, also those that are declared to be zero.
-    u_rms : float
-        Standard uncertainty of the map, rms over its coordinates, m.
-    """
-    problem = model.problem
-    known = {term.name for term in (*options.terms, *problem.terms)}
-    visited = all(visits is not None for visits in problem.ground.visits)
-    more = [ModelTerm(block.name, block.nominal) for block in blocks().values()
-            if block.nominal and not (block.sizes or block.part_of or block.name in known)
-            and (visited or not block.needs_visits)]
-    if not more:
-        return ()
-    columns = term_columns(problem.ground, (*problem.terms, *more))
-    equations = equations_of(problem, model.found, columns)
-    held, lines = model.covariance, []
-    for term in more:
-        variance = _increase(equations, columns.rows([term.name]), held, model.found.xy.sigma)
-        lines.append(BudgetLine(
-            "xy", f"term {term.name}", "B", float("nan"), term.size, term.block.unit,
-            float(np.sqrt(variance.mean())), float(np.sqrt(variance.max())), np.inf, "excluded"))
-    return tuple(sorted((line for line in lines if line.effect_rms > MATTERS * u_rms),
-                        key=lambda line: -line.effect_rms))
-
-
-def _increase(equations: TermEquations, rows: np.ndarray, held: np.ndarray,
-              sigma: float) -> np.ndarray:
-    """Return what the columns `rows` add to the variance of the known nodes, (2, nodes), m^2.
-
-    With C = `held` the covariance of the model's own coefficients, which come first, M the
-    information and F the maps of the columns:
-    (F_t - F C M_t) (M_tt + 1/size^2 - M_t' C M_t)^-1 (F_t - F C M_t)'.
-    """
-    own = slice(len(held))
-    couple = held @ equations.unbiased[own][:, rows]
-    size = equations.columns.size[rows]  # in whose units the coefficients are of equal order
-    left = equations.unbiased[np.ix_(rows, rows)] - equations.unbiased[rows][:, own] @ couple
-    left = left * np.outer(size, size) + max(sigma, LEAST_NOISE_M) ** 2 * np.eye(len(size))
-    values, vectors = np.linalg.eigh((left + left.T) / 2)
-    root = size[:, None] * vectors * sigma / np.sqrt(np.maximum(values, LEAST_NOISE_M**2))
-    maps = equations.maps[equations.system.known_sites.ravel()]
-    moved = (maps[:, rows] - maps[:, own] @ couple) @ root
-    return np.stack([(moved.real**2).sum(axis=1), (moved.imag**2).sum(axis=1)])

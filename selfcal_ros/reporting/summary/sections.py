@@ -36,7 +36,7 @@ from selfcal_ros.reporting.summary.numbers import (
     um,
 )
 from selfcal_ros.reporting.words.findings import unit_of
-from selfcal_ros.reporting.words.phrases import counted_views, dof_text, excluded_text, of_few_read
+from selfcal_ros.reporting.words.phrases import counted_views, dof_text, of_few_read
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
 
@@ -204,7 +204,6 @@ def error_section(result: CalibrationResult) -> Section:
     facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
                              (result.noise.k_xy, result.noise.dof_of("xy"))),
               *_between_nodes(result),
-              *(("not in U", printable(excluded_text(line))) for line in result.excluded),
               ("non-orthogonality", _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad",
                                                 "out of square by 2|O|")),
               ("scale difference", _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m",

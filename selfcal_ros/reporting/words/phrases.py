@@ -107,21 +107,6 @@ def line_text(line: BudgetLine) -> str:
             "none: the scale is a convention, and not part of the map")
 
 
-_EXCLUDED: dict[str, str] = {
-    "plate_shape": "bending that differs between views",
-    "drift": "drift during each view",
-    "approach": "difference between directions of approach"}
-
-
-def excluded_text(line: BudgetLine) -> str:
-    """Return an effect outside U, what it would add to u, and how it is declared."""
-    name = line.component.removeprefix("term ")
-    size, u, largest = (f"{value * UM_PER_M:.3g} µm"
-                        for value in (line.u, line.effect_rms, line.effect_max))
-    return (f"{_EXCLUDED.get(name, name)}: {size} would add u {u} rms, {largest} largest "
-            f"(declare it: --model {name}:SIZE)")
-
-
 STILL_GOOD = "Still good"
 CHANGED = "Changed"
 ONE_PASS = ("a single pass cannot tell a change from drift: measure two passes (repeats: 2, "

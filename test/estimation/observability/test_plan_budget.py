@@ -142,6 +142,7 @@ def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     monkeypatch.setattr(module, "effects_of_terms", lambda plan, *more: (
         sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1])
     found = budget_of(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
-    assert sizes[0] == (15, 15) and set(sizes[1:]) == {(11, 11)}
-    before = effects_of_terms(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
+    assert sizes[:3] == [(15, 15)] * 3 and set(sizes[3:]) == {(11, 11)}  # with the drift
+    before = effects_of_terms(plan_of("0, 90, tx", 15), [
+        *default_terms(), ModelTerm("drift", 10e-9)], Assumed(1e-9))
     assert effects(found)["microscope"] == pytest.approx(np.sqrt(before["microscope"][0].mean()))

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Effects that readings do not determine: when they are assumed, and that U then holds them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import datum_modes, remove_modes
+from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.simulation.cell import CellSettings
+from test.support.options import BARE
+from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
+
+PLATE = Artifact(9, 0.01, 24)
+DRIFT = ModelTerm("drift", 10e-9)
+
+
+def measured(seed=1, *, visits=True, consecutive=False, repeats=4, drift_m=0.0, noise_m=20e-9):
+    """Return readings of Hu's views, which drift all alike, and the truth."""
+    rng = np.random.default_rng(seed)
+    spread = Spread(phi_rad=5e-4, drift_linear_m=2 * drift_m)  # from -drift to +drift in a view
+    truth = random_truth(PLATE, 4, rng, spread)
+    truth = replace(truth, drift_m=truth.drift_m[:1].repeat(len(truth.drift_m), axis=0))
+    plan = hu_plan(PLATE, repeats)
+    plan = replace(plan, views=tuple(replace(
+        view, visit_order="x_back_y_back" if view.grid and repeats == 4 else "")
+        for view in plan.views))
+    how = CellSettings(sigma_xy_m=noise_m, sigma_theta_rad=2e-5, consecutive=consecutive)
+    return simulate_measurements(truth, plan, rng, sigma_m=noise_m, sigma_theta_rad=2e-5,
+                                 visits=visits, settings=how if visits else None), truth
+
+
+def u_of(result):
+    return np.stack([result.error_map.u_gx, result.error_map.u_gy])
+
+
+def lines(result):
+    return {line.component.removeprefix("term "): line for line in result.budget
+            if line.quantity == "xy"}
+
+
+def test_a_drift_that_the_order_hides_is_assumed():
+    readings, _ = measured(consecutive=True)
+    result = calibrate(readings, Options())
+    line = lines(result)["drift"]
+    assert (line.details["given"], line.source) == (DRIFT.size, "default")
+    declared = calibrate(readings, Options(terms=(DRIFT,)))
+    np.testing.assert_allclose(u_of(result), u_of(declared), rtol=1e-9)
+    none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
+    more = np.sqrt((u_of(result) ** 2 - u_of(none) ** 2).mean())
+    assert line.effect_rms > 5e-9
+    assert line.effect_rms == pytest.approx(more, rel=0.1)
+    assert "drift" not in lines(none)
+
+
+def test_a_drift_that_the_readings_determine_is_not():
+    result = calibrate(measured()[0], Options())
+    assert not {"drift", "approach"} & lines(result).keys()
+
+
+@pytest.mark.parametrize("options", [BARE, Options(misalignment_model="linear"),
+                                     Options(uncertainty=False)])
+def test_nothing_is_assumed_where_nothing_is_to_be_or_no_uncertainty_is_asked_for(options):
+    assert not {"drift", "approach"} & {
+        term.name for term in calibrate(measured(consecutive=True)[0], options).model.terms}
+
+
+def test_without_visits_no_drift_can_be_weighed():
+    readings, _ = measured(consecutive=True, visits=False)
+    assert "drift" not in lines(calibrate(readings, Options()))
+
+
+def test_a_drift_of_the_assumed_size_lies_in_u():
+    """One pass a view: without the assumption errors are larger than u, with it they are u."""
+    ratios = {}
+    for seed in range(8):
+        readings, truth = measured(seed, repeats=1, drift_m=DRIFT.size, noise_m=5e-9)
+        for size in (DRIFT.size, 0.0):
+            result = calibrate(readings, Options(assumed=(), causes=False, terms=(
+                replace(DRIFT, size=size),)))
+            error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
+            error = remove_modes(error, datum_modes(PLATE, scale=True))
+            ratios.setdefault(size, []).append((error / u_of(result)).ravel())
+    with_it, without = (np.sqrt(np.mean(np.square(found))) for found in ratios.values())
+    assert with_it < 1.1 < without
