@@ -166,7 +166,7 @@ def calibrate_corrected(measurements: Measurements, options: Options) -> Calibra
 def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
-    of_repeats = {"sign_not_shown", "scale_of_offsets"}
+    of_repeats = {"sign_not_shown", "scale_of_offsets", "lines_sign_not_shown"}
     failed = {found.name for found in verdict.failed}
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 

@@ -135,6 +135,21 @@ def sign_is_shown(measurements: Measurements) -> bool:
     return motion is not None and _p_for(motion, np.eye(2), -np.eye(2)) < SHOWN
 
 
+def sign_of_lines_is_shown(measurements: Measurements) -> bool:
+    """Return whether the repeats of lines confirm the sign of their offsets, or they have none.
+
+    A stage that rests on each line by its own sight has no offset, of whatever sign.
+    """
+    motions = [view.motion_theta for view in measurements.views if view.motion_theta is not None]
+    if not motions:
+        return False
+    motion = _sum(motions)
+    place, offset = np.diag(motion.products)
+    follows = place > LEAST_MOTION**2 * motion.dof
+    return bool(follows) and (offset == 0 or (
+        motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN))
+
+
 def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResponse | None:
     """Return the response that most contradicts a microscope's scale of 1 ± u_scale; None if none.
 

@@ -20,14 +20,19 @@ from scipy.special import chdtri
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.checks.wiring import contradicted_scale, sign_is_shown
+from selfcal_ros.estimation.checks.wiring import (
+    SHOWN,
+    contradicted_scale,
+    sign_is_shown,
+    sign_of_lines_is_shown,
+)
 from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
-from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested
-from selfcal_ros.estimation.joint.problem import NoiseEstimate
+from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
+from selfcal_ros.estimation.joint.problem import NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
+from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL, LEAST_NOISE_M
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
@@ -41,6 +46,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
     with_coverage,
 )
+from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
@@ -99,6 +105,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     if not solved.converged:
         failed.append(Finding("not_converged"))
     failed += _sign_findings(checked, measurements, options)
+    failed += _lines_sign_findings(checked, measurements, options)
     searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
     zero = {str(term.name) for term in options.terms if term.size == 0}
     causes = tuple(replace(cause, details={**cause.details, "declared": 0.0})
@@ -214,10 +221,8 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     Repeats show it, or the joint fit does (through rotations that lines share, and their squares),
     or the microscope was declared.
     """
-    declared = not options.assumed or any(
-        term.block.of_offsets and not term.free for term in options.terms)
     seen = all(view.visits is not None for view in measurements.views if len(view.m))
-    if declared or not seen or sign_is_shown(measurements):  # without offsets nothing can show it
+    if _is_declared(options) or not seen or sign_is_shown(measurements):  # nothing can show it
         return []
     model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
     if model is None or model.equations is None:
@@ -231,6 +236,39 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
     variance = equations.free_inverse[scale[0], scale[0]] * model.found.xy.sigma**2
     return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
+
+
+def _is_declared(options: Options) -> bool:
+    """Return whether the microscope is declared, and with it the signs of the offsets."""
+    return not options.assumed or any(
+        term.block.of_offsets and not term.free for term in options.terms)
+
+
+def _lines_sign_findings(solved: Solved, measurements: Measurements,
+                         options: Options) -> list[Finding]:
+    """Return a finding if nothing shows the sign of the lines' offsets.
+
+    Their repeats show it, or the turns of the plate that marks and lines share: with the other
+    sign the readings fit less well. Conditions of the axes show it by themselves, or the
+    microscope was declared.
+    """
+    model = solved.model
+    if (model is None or _is_declared(options) or options.datum_theta != ThetaDatum.ZERO_MEAN
+            or not np.isfinite(solved.xy.sigma)
+            or sign_of_lines_is_shown(measurements)):
+        return []
+    problem = replace(model.problem, terms=(), residuals_xy=None)
+    angular, squared = problem.angular, []
+    if not problem.system.angular.n_views:
+        return []
+    turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
+    turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
+    for sign in (1, -1):  # of the readings before they were turned into the frame of the plate
+        y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
+        read = replace(problem, angular=replace(angular, y=y))
+        squared.append(squares(read, fit(read, model.y))[0])
+    worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
+    return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
 
 
 def _scale_findings(solved: Solved, measurements: Measurements, options: Options,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
@@ -109,23 +110,45 @@ def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(readings
     assert searched == [True]
 
 
-def offsets_of(stop_sigma_m):
+def offsets_of(stop_sigma_m, servo_sigma_theta_rad):
     """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
     spread = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
     settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                            servo_sigma_theta_rad=0.0, stop_sigma_m=stop_sigma_m)
+                            servo_sigma_theta_rad=servo_sigma_theta_rad,
+                            stop_sigma_m=stop_sigma_m)
     return simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
                                  settings=settings, visits=True)
 
 
-@pytest.mark.parametrize(("stop_sigma_m", "how", "shown"), [
-    (0.0, {}, False), (20e-6, {}, True),
-    (0.0, {"terms": parse_terms(["microscope:1e-2"], "")}, True), (0.0, {"assumed": ()}, True)])
-def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(stop_sigma_m, how, shown):
-    verdict = calibrate(offsets_of(stop_sigma_m), Options(**how)).verdict
-    assert verdict.failed == (() if shown else (Finding("sign_not_shown"),))
-    assert verdict.grade is (Grade.GOOD if shown else Grade.NOT_QUALIFIED)
+@pytest.mark.parametrize(("scatter", "how", "asked"), [
+    ((0.0, 0.0), {}, ["sign_not_shown", "lines_sign_not_shown"]),
+    ((20e-6, 0.0), {}, ["lines_sign_not_shown"]), ((0.0, 1e-4), {}, ["sign_not_shown"]),
+    ((20e-6, 1e-4), {}, []),
+    ((0.0, 0.0), {"terms": parse_terms(["microscope:1e-2"], "")}, []),
+    ((0.0, 0.0), {"assumed": ()}, [])])
+def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how, asked):
+    verdict = calibrate(offsets_of(*scatter), Options(**how)).verdict
+    assert [found.name for found in verdict.failed] == asked
+    assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
+
+
+@pytest.mark.parametrize(("turn_rad", "asked"), [(1e-7, True), (2e-5, False)])
+def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked):
+    """With the wrong sign the angular map is that of another stage: refused, or nobody knows."""
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
+    truth = random_truth(plan.artifact, 4, rng, Spread(rotation="finite", phi_rad=turn_rad))
+    readings = simulate_measurements(truth, plan, rng, visits=True, settings=CellSettings(
+        sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_theta_rad=0.0, stop_sigma_m=20e-6))
+    reversed_lines = replace(readings, views=tuple(
+        replace(view, dtheta=-view.dtheta) for view in readings.views))
+    names = [found.name for found in calibrate(readings, Options()).verdict.failed]
+    assert ("lines_sign_not_shown" in names) is asked
+    if asked:
+        assert not calibrate(reversed_lines, Options()).verdict.qualified
+    else:
+        with pytest.raises(WiringError, match="offset_theta has the other sign"):
+            calibrate(reversed_lines, Options())
 
 
 @pytest.mark.parametrize(("given", "is_declared"), [("plate_shape:0", True),
