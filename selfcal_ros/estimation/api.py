@@ -31,7 +31,6 @@ from selfcal_ros.estimation.joint.camera import (
 )
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
-from selfcal_ros.estimation.joint.untold import untold_terms
 from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -42,7 +41,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import microscope_term
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.units import NS_PER_S
 
@@ -95,7 +94,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         known = microscope_term(float(scale), float(turn), float(other.max()))
         options = replace(options, assumed=tuple(
             known if term.block.of_offsets else term for term in options.assumed))
-    solved, options, findings = _solved(measurements, options)
+    solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
     joint, converged = options.method == "joint", solved.converged
     if joint and not converged:  # first: with a wrong wiring the search for causes takes seconds
         _check_turned(measurements, options, contradicted=True)
@@ -105,7 +104,6 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         _check_turned(measurements, options, contradicted=not _fits(result))
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
-    result = replace(result, findings=(*result.findings, *findings))
     shown = {} if camera is None else camera.to_dict()
     if solved.model is not None and measurements.has_images:
         yaw = yaw_of(solved.model, measurements.sense)
@@ -114,26 +112,6 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if measurements.has_images:
         result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
     return result
-
-
-def _solved(measurements: Measurements,
-            options: Options) -> tuple[Solved, Options, tuple[Finding, ...]]:
-    """Return the solution that assumes what the readings do not determine, and its options.
-
-    Where that does not converge it is left out, and a finding says so.
-    """
-    if options.method == "law":
-        return solve_law(measurements, options), options, ()
-    solved = solve_joint(measurements, options)
-    untold = untold_terms(solved, options)
-    if not untold:
-        return solved, options, ()
-    assuming = replace(options, assumed=(*options.assumed, *untold))
-    with_them = solve_joint(measurements, assuming)
-    if with_them.converged:
-        return with_them, assuming, ()
-    return solved, options, (Finding("untold_left_out", details={
-        "terms": [str(term.name) for term in untold]}),)
 
 
 def calibrate_corrected(measurements: Measurements, options: Options) -> CalibrationResult:

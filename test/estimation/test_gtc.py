@@ -36,7 +36,7 @@ def test_the_budget_of_a_map_has_u_dof_and_k_of_gtc(u_scale):
                                         ((0.3, 4.0), (60.0, 2.5))])
 def test_the_deviation_of_a_run_has_the_dof_of_gtc(u, dof):
     runs = [Run(np.array([9.0 * (i == 0), 0, 0, 0]), one**2 * np.eye(4), np.zeros((4, 4)), True,
-                many, True) for i, (one, many) in enumerate(zip(u, dof, strict=True))]
+                many) for i, (one, many) in enumerate(zip(u, dof, strict=True))]
     e_n = mean_of(runs, np.zeros((4, 0)), np.zeros((4, 0))).deviations[0].e_n[0]
     difference = gtc.ureal(9.0, u[0], dof[0]) - gtc.ureal(0.0, u[1], dof[1])
     assert e_n == pytest.approx(9.0 / (coverage_factor(gtc.dof(difference))

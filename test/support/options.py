@@ -4,6 +4,7 @@
 from typing import Any
 
 from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.model.terms import ModelTerm
 
 
 def bare(**how: Any) -> Options:
@@ -12,6 +13,9 @@ def bare(**how: Any) -> Options:
 
 
 BARE = bare()
+
+STILL = (ModelTerm("drift", 0.0), ModelTerm("approach", 0.0))
+"""Declarations that a stage neither drifts nor errs by the direction of approach."""
 
 
 MARKS = ((-1, 0), (1, 1))

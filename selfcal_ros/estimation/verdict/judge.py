@@ -46,6 +46,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
     with_coverage,
 )
+from selfcal_ros.estimation.verdict.untold import untold_effects
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
@@ -121,7 +122,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
         **({"certified": reference.certified} if reference.certified else {}),
         **({"marks": [*map(list, reference.marks)]} if reference.marks else {})})
     effects = [*searched.effects, *_beyond_repeats(solved)]
-    result = with_coverage(enlarged(result, effects))
+    result = with_coverage(enlarged(result, [*effects, *untold_effects(solved, options)]))
     bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)
     grade = (Grade.GOOD if not (failed or noises or causes) else
              Grade.ENLARGED if bounded and not failed and result.has_uncertainty else

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solve import (
     ANGULAR_KEY,
@@ -312,6 +313,11 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
     term = next((term for term in result.model.terms if term.name == name), None)
     if term is None:
         cause = next((cause for cause in result.verdict.causes if cause.name == name), None)
+        if cause is None and name in blocks():  # not determined by the readings
+            block = block_of(name)
+            return BudgetLine(quantity, f"term {name}", "B", np.nan, block.nominal, block.unit,
+                              *effect, np.inf, "default",
+                              {"given": block.nominal, "allowed": None, "remaining": 1.0})
         value, u_value, unit = (np.nan, np.nan, "m") if cause is None else (
             cause.size, cause.u, cause.unit)
         return BudgetLine(quantity, f"effect {name}", "B", value, u_value, unit, *effect, np.inf,

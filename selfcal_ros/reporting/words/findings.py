@@ -248,9 +248,6 @@ SENTENCES: dict[str, Words] = {
     "rest_not_converged": lambda f, of: "cannot be held out: the rest does not converge",
     "nothing_to_predict": lambda f, of: (
         "nothing to predict: no held-out mark is known from the rest"),
-    "untold_left_out": lambda f, of: (
-        f"U does not contain what these readings do not determine: {' and '.join(of['terms'])}; "
-        "measure two passes, there and back (repeats: 2, visit_order: there_and_back)"),
     "own_terms_unknown": lambda f, of: (
         f"its own {' and '.join(of['terms'])} cannot be known: not judged")}
 

@@ -15,6 +15,7 @@ from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.dense_fit import DenseFit
+from test.support.options import STILL
 from test.support.truth import hu_plan, simulate_measurements
 
 SIZED = "plate_scale:1e-7,plate_shape:5e-9"
@@ -51,7 +52,7 @@ def test_either_coordinate_lies_within_its_own_uncertainty(repeats):
     inside = []
     for seed in range(6):
         truth, readings = measured(0.25, size=11, repeats=repeats, seed=seed)
-        result = calibrate(readings, Options(terms=parse_terms(["plate_shape:0"], "")))
+        result = calibrate(readings, Options(terms=(*STILL, *parse_terms(["plate_shape:0"], ""))))
         k, emap = result.noise.k_xy, result.error_map
         known = np.isfinite(emap.gx)
         error = np.stack([emap.gx, emap.gy]) - truth.g

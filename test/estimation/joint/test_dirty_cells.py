@@ -21,6 +21,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import few_read_text
 from selfcal_ros.simulation import physics
 from test.estimation.joint.test_images import DISTORTED, MARK, measured, within
+from test.support.options import STILL
 
 CORNER = (1, 1)
 
@@ -51,7 +52,7 @@ def population(dirty, runs):
     maps, cameras, results = [], [], []
     for seed in range(runs):
         truth, measurements = measured(MARK, seed, size=7, **DISTORTED)
-        found = calibrate(with_dirt(measurements, dirty), Options(causes=False))
+        found = calibrate(with_dirt(measurements, dirty), Options(causes=False, terms=STILL))
         emap, cells = found.error_map, cells_of(found)
         maps.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
         cameras.append((cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2]))

@@ -22,6 +22,7 @@ from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
+from test.support.options import STILL
 from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
@@ -161,7 +162,7 @@ def population(image_m: float, size: int, runs: int, *, options: Options | None 
     away, results = [], []
     for seed in range(runs):
         truth, measurements = measured(image_m, seed, size=size, **settings)
-        found = calibrate(measurements, options)
+        found = calibrate(measurements, options or Options(terms=STILL))
         emap = found.error_map
         error = np.stack([emap.gx, emap.gy]) - truth.g
         away.append(error / np.stack([emap.u_gx, emap.u_gy]))

@@ -16,6 +16,7 @@ from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.physics import between_sites
 from test.estimation.joint.test_images import MARK, datum, dense, measured, population, within
+from test.support.options import STILL
 from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
@@ -194,7 +195,7 @@ def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, mo
     measurements = simulate_measurements(
         truth, image_plan(7, repeats=1), np.random.default_rng(3),
         settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0))
-    found = calibrate(measurements, Options(terms=parse_terms(more, "test")))
+    found = calibrate(measurements, Options(terms=(*STILL, *parse_terms(more, "test"))))
     causes = {cause.name: cause for cause in found.verdict.causes}
     assert list(causes) == ["yaw"] * (size == 1e-3 and not more)
     emap = found.error_map
@@ -202,7 +203,7 @@ def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, mo
     if causes:
         (tried, *_) = causes["yaw"].remedies
         assert tried.kind == "model"
-        given = replace(Options(), terms=parse_terms([tried.value], "test"))
+        given = replace(Options(), terms=(*STILL, *parse_terms([tried.value], "test")))
         assert not calibrate(measurements, given).verdict.causes
 
 
@@ -218,7 +219,7 @@ def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly(bend_m
         truth = replace(truth, yaw=slope, plate_shape_m=shape)
         found = calibrate(simulate_measurements(
             truth, image_plan(7, repeats=1), np.random.default_rng(seed),
-            settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0)))
+            settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0)), Options(terms=STILL))
         assert [cause.name for cause in found.verdict.causes] == ["plate_shape"]
         assert found.verdict.qualified
         of = {(one.component, one.view): one.value for term in found.model.terms

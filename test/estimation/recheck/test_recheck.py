@@ -34,7 +34,7 @@ from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support import placed
 from test.support.lattice_plans import plan_of
-from test.support.options import BARE, bare
+from test.support.options import BARE, STILL, bare
 from test.support.truth import simulate_measurements
 from test.support.two_sessions import MICROSCOPE, TwoSessions
 
@@ -57,7 +57,7 @@ def _equal_white_noise(monkeypatch):
 
 
 def linear(model="none"):
-    return replace(bare(causes=False, at_places=False, misalignment_model=(
+    return replace(bare(causes=False, at_places=False, terms=STILL, misalignment_model=(
         "linear" if model == "none" else "rigid")), assumed=parse_terms([MODELS[model]], ""))
 
 

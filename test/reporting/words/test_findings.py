@@ -231,9 +231,6 @@ FINDINGS = [
      "counter-clockwise by 2.000 ± 0.010 mrad, which explains them better: no view was split"),
     (Finding("slips_given_up", details={"slips": 3}),
      "gave up on slips after 3: the readings seem to contain more; measure again"),
-    (Finding("untold_left_out", details={"terms": ["drift"]}),
-     "U does not contain what these readings do not determine: drift; measure two passes, there "
-     "and back (repeats: 2, visit_order: there_and_back)"),
     (Finding("own_terms_unknown", details={"terms": ["drift", "plate_scale"]}),
      "its own drift and plate_scale cannot be known: not judged")]
 

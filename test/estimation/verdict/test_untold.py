@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import xy_covariance
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import datum_modes, remove_modes
+from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.options import BARE
@@ -19,7 +21,8 @@ PLATE = Artifact(9, 0.01, 24)
 DRIFT = ModelTerm("drift", 10e-9)
 
 
-def measured(seed=1, *, visits=True, consecutive=False, repeats=4, drift_m=0.0, noise_m=20e-9):
+def measured(seed=1, *, visits=True, consecutive=False, repeats=4, drift_m=0.0, noise_m=20e-9,
+             sense=Sense.MICROSCOPE_MOVES):
     """Return readings of Hu's views, which drift all alike, and the truth."""
     rng = np.random.default_rng(seed)
     spread = Spread(phi_rad=5e-4, drift_linear_m=2 * drift_m)  # from -drift to +drift in a view
@@ -29,7 +32,7 @@ def measured(seed=1, *, visits=True, consecutive=False, repeats=4, drift_m=0.0, 
     plan = replace(plan, views=tuple(replace(
         view, visit_order="x_back_y_back" if view.grid and repeats == 4 else "")
         for view in plan.views))
-    how = CellSettings(sigma_xy_m=noise_m, sigma_theta_rad=2e-5, consecutive=consecutive)
+    how = CellSettings(sense, sigma_xy_m=noise_m, sigma_theta_rad=2e-5, consecutive=consecutive)
     return simulate_measurements(truth, plan, rng, sigma_m=noise_m, sigma_theta_rad=2e-5,
                                  visits=visits, settings=how if visits else None), truth
 
@@ -43,18 +46,28 @@ def lines(result):
             if line.quantity == "xy"}
 
 
-def test_a_drift_that_the_order_hides_is_assumed():
-    readings, _ = measured(consecutive=True)
+@pytest.mark.parametrize("sense", Sense)
+def test_a_drift_that_the_order_hides_is_assumed(sense):
+    """It adds what the declared term does, node by node."""
+    readings, _ = measured(consecutive=True, sense=sense)
     result = calibrate(readings, Options())
     line = lines(result)["drift"]
-    assert (line.details["given"], line.source) == (DRIFT.size, "default")
-    declared = calibrate(readings, Options(terms=(DRIFT,)))
-    np.testing.assert_allclose(u_of(result), u_of(declared), rtol=1e-9)
+    assert (line.component, line.u, line.source) == ("term drift", DRIFT.size, "default")
     none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
-    more = np.sqrt((u_of(result) ** 2 - u_of(none) ** 2).mean())
-    assert line.effect_rms > 5e-9
-    assert line.effect_rms == pytest.approx(more, rel=0.1)
-    assert "drift" not in lines(none)
+    added = np.sqrt(u_of(result) ** 2 - u_of(none) ** 2)
+    assert line.effect_rms == pytest.approx(rms(added))
+    assert line.effect_max == pytest.approx(added.max())
+    np.testing.assert_array_equal(result.error_map.gx, none.error_map.gx)
+    assert "drift" not in lines(none) and result.verdict.causes == ()
+    declared = calibrate(readings, Options(terms=(DRIFT,)))
+    np.testing.assert_allclose(u_of(result), u_of(declared), rtol=0.03)
+
+
+def test_its_nodes_are_correlated_as_by_the_declared_term():
+    readings, _ = measured(consecutive=True)
+    one, other = (xy_covariance(result, result.error_map.valid) for result in (
+        calibrate(readings, Options()), calibrate(readings, Options(terms=(DRIFT,)))))
+    np.testing.assert_allclose(one, other, atol=0.05 * np.abs(other).max())
 
 
 def test_a_drift_that_the_readings_determine_is_not():
@@ -66,7 +79,7 @@ def test_a_drift_that_the_readings_determine_is_not():
                                      Options(uncertainty=False)])
 def test_nothing_is_assumed_where_nothing_is_to_be_or_no_uncertainty_is_asked_for(options):
     assert not {"drift", "approach"} & {
-        term.name for term in calibrate(measured(consecutive=True)[0], options).model.terms}
+        *lines(calibrate(measured(consecutive=True)[0], options))}
 
 
 def test_without_visits_no_drift_can_be_weighed():
