@@ -374,7 +374,7 @@ class _Kept:
 
         Complex (n, free + 1).
         """
-        rows = []
+        rows = [np.zeros((0, self.free + 1), dtype=complex)]
         for number, seen in enumerate(views, first):
             row = np.zeros((len(seen.place), self.free + 1), dtype=complex)
             row[:, FREE * number:FREE * (number + 1)] = _motion(seen)
@@ -385,8 +385,9 @@ class _Kept:
 
 def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     """Return turns of the plate and marks of all readings, complex (n,) each."""
-    return (np.concatenate([np.full(len(seen.place), seen.pose.phase) for seen in views]),
-            np.round(np.concatenate([seen.marks for seen in views]), 3))
+    none = np.zeros(0, dtype=complex)
+    return (np.concatenate([none, *(np.full(len(seen.place), seen.pose.phase) for seen in views)]),
+            np.round(np.concatenate([none, *(seen.marks for seen in views)]), 3))
 
 
 def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:

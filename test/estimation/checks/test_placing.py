@@ -92,6 +92,18 @@ def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats, others
     assert found is not None and (found.view, found.found_deg) == ("90", 270)
 
 
+def test_the_cells_of_one_view_alone_name_no_pose():
+    """The first view of a run, which is checked as soon as it has been measured."""
+    truth = random_truth(Artifact(7, 1e-3, 0), 1, np.random.default_rng(3))
+    readings = simulate_measurements(truth, image_plan(7, turns=(0,)), np.random.default_rng(4),
+                                     sigma_m=2e-8)
+    rng = np.random.default_rng(5)
+    dirty = tuple(replace(cell, dx=cell.dx + rng.normal(0, 1e-6, len(cell.dx)))
+                  for cell in readings.views)
+    assert len({cell.view.plan_view for cell in dirty}) == 1 < len(dirty)
+    assert misplaced(unrepeated(replace(readings, views=dirty))) is None
+
+
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize("name", WRONG)
 def test_ids_tell_how_a_plate_lies_by_themselves(name, sense):
