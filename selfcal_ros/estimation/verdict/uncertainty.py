@@ -316,8 +316,7 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         if cause is None and name in blocks():  # not determined by the readings
             block = block_of(name)
             return BudgetLine(quantity, f"term {name}", "B", np.nan, block.nominal, block.unit,
-                              *effect, np.inf, "default",
-                              {"given": block.nominal, "allowed": None, "remaining": 1.0})
+                              *effect, np.inf, "default", {"given": block.nominal})
         value, u_value, unit = (np.nan, np.nan, "m") if cause is None else (
             cause.size, cause.u, cause.unit)
         return BudgetLine(quantity, f"effect {name}", "B", value, u_value, unit, *effect, np.inf,

@@ -83,6 +83,8 @@ def line_text(line: BudgetLine) -> str:
     if "by" in of:
         return _NOISES[of["by"]] + (", the larger of two that contradict each other (see the "
                                     "verdict)" if of["contradicted"] else "")
+    if "given" in of and "remaining" not in of:
+        return f"size {of['given']:.3g}, what the readings do not determine of it"
     if "given" in of:
         given = f"size {of['given']:.3g}, " + (
             "of which the readings" if of["allowed"] is None else

@@ -13,6 +13,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.options import BARE
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
@@ -53,6 +54,7 @@ def test_a_drift_that_the_order_hides_is_assumed(sense):
     result = calibrate(readings, Options())
     line = lines(result)["drift"]
     assert (line.component, line.u, line.source) == ("term drift", DRIFT.size, "default")
+    assert line_text(line) == "size 1e-08, what the readings do not determine of it"
     none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
     added = np.sqrt(u_of(result) ** 2 - u_of(none) ** 2)
     assert line.effect_rms == pytest.approx(rms(added))
