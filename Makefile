@@ -37,7 +37,7 @@ build/machines/.complete: tools/machine-requirements.txt | setup
 		--upgrade --target build/machines -r $< && touch $@ || echo "test: pymmcore and pyserial are left out: they cannot be installed"
 build/oracles/dcc/dcc.xsd: tools/dcc_schema.py | setup
 	@$(BIN)/python $< $(@D) || true
-test: lint ament-lint tests  ## everything: linters and all tests, ten minutes
+test: lint ament-lint tests  ## everything: linters and all tests, a quarter of an hour and more
 tests: build/oracles/.complete build/oracles/dcc/dcc.xsd build/machines/.complete  ## all tests, without the linters
 	@PYTHONDONTWRITEBYTECODE= PYTHONPATH="$(CURDIR)/build/oracles:$(CURDIR)/build/machines$${PYTHONPATH:+:$$PYTHONPATH}" $(BIN)/python -m pytest -n 3 --dist worksteal
 quick: setup  ## two minutes: the tests that reach most of the code

@@ -92,7 +92,8 @@ class Block:
         A size so small that any readings that show the effect contradict it: with it a block joins
         the model if it is found in the residuals.
     nominal : float
-        Size for which the effect outside the model is stated; 0: it is not.
+        Size that is assumed where the readings do not determine the effect, if there are no
+        `sizes`, and for which plans are judged; 0: neither.
     sizes : tuple of float
         Standard deviations that are assumed unless declared (GUM type B): one, or one of each of
         `parts`. Empty: the effect is not in the model unless it is asked for or found.
