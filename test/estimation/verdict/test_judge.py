@@ -17,6 +17,7 @@ from selfcal_ros.estimation.verdict.judge import judged, provenance_of
 from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.reporting.words.findings import worded
@@ -133,13 +134,15 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
 
 
+@pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize(("turn_rad", "asked"), [(1e-7, True), (2e-5, False)])
-def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked):
+def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked, sense):
     """With the wrong sign the angular map is that of another stage: refused, or nobody knows."""
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
     truth = random_truth(plan.artifact, 4, rng, Spread(rotation="finite", phi_rad=turn_rad))
     readings = simulate_measurements(truth, plan, rng, visits=True, settings=CellSettings(
-        sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_theta_rad=0.0, stop_sigma_m=20e-6))
+        sense, sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_theta_rad=0.0,
+        stop_sigma_m=20e-6))
     reversed_lines = replace(readings, views=tuple(
         replace(view, dtheta=-view.dtheta) for view in readings.views))
     names = [found.name for found in calibrate(readings, Options()).verdict.failed]
