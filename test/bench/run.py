@@ -90,7 +90,7 @@ def ours(benchmark: str, data) -> tuple:
     from selfcal_ros.estimation.normal.equations import clear_cache
     from selfcal_ros.estimation.options import Options
 
-    quick = Options(misalignment_model="linear", uncertainty=False)
+    quick = Options(misalignment_model="linear", uncertainty=False, causes=False)
 
     def cold():
         clear_cache()
