@@ -200,12 +200,13 @@ def parameters_text() -> str:
 
 
 def message_rows() -> Iterator[tuple[str, ...]]:
-    """Yield each message, service and action with what its definition says at its beginning."""
+    """Yield each message, service and action with the first sentence of its definition."""
     for kind in ("msg", "srv", "action"):
         for path in sorted((ROOT / "msg_defs" / kind).iterdir()):
             about = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
             words = " ".join(line.lstrip("# ") for line in about)
-            yield f"[{path.name}](../../{path.relative_to(ROOT)})", words
+            first = words.partition(". ")[0].rstrip(".") + "."
+            yield f"[{path.name}](../../{path.relative_to(ROOT)})", first
 
 
 def text(result: dict[str, Any]) -> str:
