@@ -13,7 +13,7 @@ from selfcal_ros.cli.deliver import command, deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
-from selfcal_ros.controllers.gcode_codes import DIALECTS, PRINTERS
+from selfcal_ros.controllers.gcode_codes import DIALECTS
 from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
@@ -45,16 +45,14 @@ def run(args: argparse.Namespace) -> int:
     if 10.0**-args.decimals * 1e3 > 2 * args.tolerance:
         raise InputError("--decimals", f"{args.decimals} round by more than {args.tolerance:g} um",
                          "give more, or a larger --tolerance")
-    if args.dialect in PRINTERS and args.unit == "in":
-        raise InputError("--unit", f"programs for {args.dialect} are in mm", "leave it out")
-    unit, args.unit = args.unit, args.unit or "mm"
+    args.unit = args.unit or "mm"
     frame = replace(frame_of(args), unit="m")
     check_outputs([args.program, args.result], [file_of(args)])
     result, filled = ready(args)
     plate = result.artifact
     rewriter = Rewriter(
         wanted(result.error_map, Wiring(frame)), dialect=args.dialect,
-        tolerance_m=args.tolerance * M_PER_UM, step_m=plate.grid_pitch_m / 32, unit=unit,
+        tolerance_m=args.tolerance * M_PER_UM, step_m=plate.grid_pitch_m / 32,
         decimals=args.decimals)
     text = read_text(args.program)
     if not text.strip():

@@ -50,11 +50,11 @@ def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys
     assert float(first[2][1:]) == pytest.approx(1e3 * MAP.gy[site], abs=6e-7)
 
 
-def test_inches_without_a_word_for_them_are_told(capsys):
-    Path("in.nc").write_text("G90\nG0 X0.3937007874 Y0\n")
-    assert run("in.nc R.json -o - --unit in --json --decimals 7") == 0
+def test_the_json_has_the_program_and_the_unit_is_that_of_home_alone(capsys):
+    Path("in.nc").write_text("G90 G21\nG0 X10 Y0\n")
+    assert run("in.nc R.json -o - --unit in --home-x 0.3937007874 --json --decimals 7") == 0
     word = json.loads(capsys.readouterr().out)["program"].splitlines()[4].split()[1]
-    assert float(word[1:]) * 0.0254 == pytest.approx(0.01 + MAP.gx[3, 2], abs=1e-10)
+    assert float(word[1:]) / 1e3 == pytest.approx(0.01 + MAP.gx[4, 2], abs=1e-9)
 
 
 @pytest.mark.parametrize(("line", "message"), [
@@ -62,7 +62,6 @@ def test_inches_without_a_word_for_them_are_told(capsys):
     ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
     ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
     ("in.nc R.json -o o.nc --decimals 2", "--decimals: 2 round by more than 1 um; give more"),
-    ("in.nc R.json -o o.nc --unit in --dialect klipper", "--unit: programs for klipper are in mm"),
     ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes")])
 def test_what_is_not_possible_is_one_line(capsys, line, message):
     Path("bad.nc").write_text("G92 X0 Y0\n")

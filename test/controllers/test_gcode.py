@@ -31,7 +31,7 @@ ROUNDING_MM = 3e-5
 MILL = """%
 (pocket, 4 mm mill)
 N10 G21 G17 G90 G94 G54 G91.1
-N15 G64 P0.01
+N15 G64 P0.01 Q0
 N20 T1 M6
 N25 G43 H1
 N30 S12000 M3
@@ -40,23 +40,21 @@ N50 G1 Z-1. F200 ; plunge
 N60 G1 X40. Y0. F800
 N70 X50. Y10. M8 (coolant on the way)
 N80 G3 X40. Y20. I-10. J0.
-N90 X30. Y10. R10.
+N90 X30. Y10. J-10.
 N100 g 2 X30. Y10. Z-2. I5. J5.
 N120 G91
 N130 G1 X5. Y2.5
 N140 Y-20. Z-.5
-N145 G3 X-2. Y2. R-2.
 N150 G90 G0 Z5.
 N160 G98 G81 X10. Y10. Z-3. R1. F100
 N170 X20.
 N180 G80
 N190 G0 X0. Y0. Z5. M5
 N195 G53 G0 Z0
-N196 G43.1 Z12
-N198 G38.2 Z-3 F50
-N199 G91 G28 X0 Y0
+N196 G91 G28 Z0
 N200 G90 G0 X3 Y3 Z1
-N210 G1 X40. Y-20. M2
+N210 G1 X40. Y-20.
+N220 M2
 %
 """
 LASER = """; made by hand (GRBL)
@@ -67,12 +65,13 @@ G0 X0Y0
 G1X1.5Y0S500F100
 X1.5Y0.75
 G2X0.5Y0.75I-0.5J0
-G3 X-0.25 Y0 R-0.75
+G3 X-0.25 Y0 I-0.75
 g1 x0 y0
 G28
 M5
 G0 X1 Y1
-G1 X1.2 M30
+G1 X1.2
+M30
 """
 PRINTER = """; FLAVOR:Marlin
 M117 Printing, layer 1
@@ -231,16 +230,18 @@ def test_no_random_program_leads_the_stage_elsewhere(dialect, lines, said):
 REFUSED = """
 grbl | G21 // G1 X5 Y5 | 2: the program has not said G90 or G91
 grbl | G90 // G0 X5 Y5 | 2: the program has not said G20 or G21
-grbl | G21 G90 // G0 X5 Y5 // G2 X6 Y6 R4 | 3: the program has not said G17
-linuxcnc | G21 G90 // G0 X5 Y5 // G1 X6 | 3: the program has not said G61, G61.1 or G64
-linuxcnc | G64 P0.01 Q0.01 | 1: G64 Q merges
+grbl | G21 G90 // G0 X5 Y5 // G2 X6 Y6 I1 | 3: the program has not said G17
+linuxcnc | G21 G90 // G0 X5 Y5 // G1 X6 | 3: the program has not said G61 or G61.1 or G64
+linuxcnc | G64 P0.01 Q0.01 | 1: G64 P merges
+linuxcnc | G64 P0.01 | 1: G64 P merges the pieces of corrected lines; write Q0 behind it
 grbl | G21 G90 // X5 | 2: the line does not name its command
 grbl | +G91 // G0 X5 | 5: the position before this line is not known
 grbl | +G90 // G0 X0 Y0 // G28 // G1 X5 | 7: the position before this line is not known
-grbl | +G0 X0 Y0 Z5 // G53 G0 Z0 // G1 X40 Y20 Z1 | 6: Z or its mode before this line is not
-grbl | +G0 X0 Y0 Z5 // G38.2 Z0 // G1 X40 Y20 Z1 | 6: Z or its mode before this line is not
-grbl | +G53 G0 X0 | 4: G0 is not a move in the XY plane of the map
-grbl | +G28 X0 Y0 | 4: G28 passes a point that is not corrected
+grbl | +G0 X0 Y0 Z5 // G53 G0 Z0 // G1 X40 Y20 Z1 | 6: Z before this line is not
+grbl | +G38.2 Z0 | 4: G38.2 is not in the list
+grbl | +G53 G0 X0 | 4: G53 leaves the frame of the map; write G0 or G1, and Z alone
+grbl | +G53 G2 X1 I1 | 4: G53 leaves the frame
+grbl | +G91 G28 X0 | 4: X is not a word of G91 G28
 grbl | +G54 // G0 X0 Y0 // G55 | 6: G55 follows a move in X or Y; set the frame before
 linuxcnc | +G43 H1 // G0 X0 Y0 // G43 H2 | 6: G43 follows a move in X or Y
 grbl | +G0 X0 Y0 // G20 | 5: G20 follows a move in X or Y
@@ -261,40 +262,43 @@ linuxcnc | % // M5 // % // M3 | 4
 linuxcnc | +G1 X#1 Y0 | 4: 'X' does not
 linuxcnc | +G0 X[1+2] | 4: 'X' does not
 grbl | +G1 X1 X2 | 4: X is given twice
-grbl | +G0 G1 X1 | 4: G0 and G1 in one
-grbl | +G0 X0 Y0 // G1 X4 F0 | 5: the feed is not positive
-grbl | G0 X1 N5 | 1: N does not begin
+grbl | +G0 G1 X1 | 4: G0 G1 in one
+grbl | +G0 X0 M30 | 4: the program stops in the line of a move; stop in the next line
+linuxcnc | +G0 X0 M1 | 4: the program stops
 grbl | +G0 X1 0 | 4: '0' does not
 grbl | +G0 X1e3 | 4: E is not a word of G0
 grbl | +G4 P1 X5 | 4: X is not a
 linuxcnc | +G0 X1 Y1 C5 | 4: C is not a word of G0
 linuxcnc | +G64 // G0 X0 Y0 Z5 // G81 X1 Z-1 R1 L3 | 6: L is not a word of G81; write each
-linuxcnc | +G64 // G0 X0 Y0 // G91 // G81 X1 Z-1 R1 | 7: G81 is not a move in the XY plane
-grbl | +G18 // G0 X0 Y0 // G2 X1 Y0 R5 | 6: G2 is not a move in the XY plane
-grbl | +G0 X0 Y0 // G2 X10 Y0 R4 | 5: no arc of this radius
-grbl | +G0 X0 Y0 // G2 X0 Y0 R4 | 5: no arc of this radius
-grbl | +G0 X0 Y0 // G2 X10 I5 // X20 Y5 | 6: an arc needs R, or I and J
-grbl | +G0 X0 Y0 // G2 X10 I5 R5 | 5: an arc needs R, or I and J
+linuxcnc | +G64 // G0 X0 Y0 // G91 // G81 X1 Z-1 R1 | 7: G81 by increments; write G90
+grbl | +G18 | 4: G18 is not in the list of codes that are known of grbl; have arcs written in
+grbl | +G0 X0 Y0 // G2 X10 Y0 R4 | 5: R is not a word of G2
+grbl | +G0 X0 Y0 // G2 X10 I5 // X20 Y5 | 6: the arc has no centre; give I and J
+grbl | +G0 X0 Y0 // G2 X10 I10 | 5: the arc has no centre
+grbl | +G0 X0 Y0 // G91 // G2 X10 I5 | 6: G2 by increments; write G90 before arcs
+grbl | +G2 X1 I5 | 4: the position
 grbl | +G0 X0 Y0 // G2 I5 | 5: grbl needs X or Y
-grbl | +G2 X1 R5 | 4: the position
-grbl | +G0 X0 Y0 // G2 X10.0011 Y0 I5 | 5: the ends of the arc are 5.000000 and 5.001100
-grbl | +G0 X0 Y0 // G2 X0 Y0.0001 I5 | 5: the ends of the arc
+grbl | +G0 X0 Y0 // G2 X10.0011 Y0 I5 | 5: the arc ends at 1.000220 times its radius
+grbl | +G0 X0 Y0 // G2 X0 Y0.0001 I5 | 5: the arc ends
 grbl | +G0 X0 Y0 // G2 X10 I5 P2 | 5: P is not a word of G2; write each repeat, turn
 grbl | +G1 X5 Y5 | 4: the position before this line is not known
 marlin | +G1 X5 Y5 E1 | 4: the position before this line is not known
-marlin | +G0 X0 Y0 // G1 X40 Y20 E1 | 5: E or its mode before this line is not known
-marlin | G21 G90 | 1: G21 and G90 in one line
+marlin | +G0 X0 Y0 // G1 X40 Y20 E1 | 5: E before this line is not known
+marlin | G21 G90 | 1: G21 G90 in one line
 marlin | X5 | 1: the line does not
 marlin | X5 G1 | 1: the line does not begin
 marlin | T0 | 1: the line does not
 marlin | N5 G1 X1*33 | 1: '*' does not belong
 marlin | +g1 X5 | 4: 'g' does not
-klipper | G01 X5 | 1: G01 is not in the list of codes that are known of klipper; write G1
+klipper | G01 X5 | 1: G01 is not understood by all firmware; write G1
 marlin | G0 X | 1: X has no number
-klipper | +G0 X0 Y0 // G91 // G2 X5 I2.5 | 6: G2 is
+marlin | G90 // G1 E1 | 2: the program has not said M82 or M83; write it after the last G90
+marlin | M83 // G90 // G1 E1 | 3: the program has not said M82
+marlin | G91 // M82 | 2: firmware disagrees on M82 after G91; write G90
 klipper | +G0 X0 Y0 // G2 X5 R5 | 5: R is not a word of G2
 klipper | G20 | 1: G20
-klipper | SET_GCODE_OFFSET X=2 | 1: SET_GCODE_OFFSET may move anything
+klipper | SET_GCODE_OFFSET X=2 | 1: '_' does not belong to a word of klipper
+klipper | PARK | 1: the line does not begin with a command
 klipper | G1 X5 (a) | 1: '(' does
 """
 """Dialect, program (+: its modes are said; //: end of line), line and reason."""
@@ -345,7 +349,7 @@ def test_lines_without_motion_are_kept_letter_by_letter():
 def test_the_polygon_of_few_points_stays_within_the_tolerance():
     t = np.linspace(0, 2 * np.pi, 5000)
     circle = np.stack([np.cos(t), np.sin(t)], axis=1)
-    kept = simplified(circle, 1e-3)
+    kept = simplified(np.exp(1j * t), 1e-3)
     assert 40 < len(kept) < 200 and farthest(circle[::13], circle[kept]) <= 1e-3 + 1e-6
 
 
