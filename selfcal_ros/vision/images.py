@@ -23,6 +23,11 @@ EXPANSION = 1000
 """Largest number of pixels per byte of an encoded image: more is no picture of a camera."""
 FORMATS = ("PNG", "JPEG", "TIFF")
 """Formats that are decoded. Pillow starts programs for some others."""
+SAVE_AS = "give PNG, JPEG or TIFF: grey of 8 or 16 bits, or colour of 8"
+ORIENTATION, BITS, PHOTOMETRIC, SAMPLE_FORMAT = 274, 258, 262, 339
+"""Tags of EXIF and TIFF."""
+WHITE_IS_ZERO, SIGNED = 0, 2
+"""Values of PHOTOMETRIC and SAMPLE_FORMAT."""
 GREY_MODES = {"L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
 """Modes of Pillow with one value per pixel; those of 16 bits in I, too."""
 
@@ -97,10 +102,10 @@ def decoded(data: Buffer, where: str, check: Check = any_size) -> Picture:
     except InputError:
         raise
     except UnidentifiedImageError as error:  # its text has the address of an object
-        raise InputError(where, "not an image, or damaged", "give PNG, JPEG or TIFF") from error
+        raise InputError(where, "not an image of a known kind, or damaged", SAVE_AS) from error
     except Exception as error:  # the decoders of Pillow raise many kinds
         raise InputError(where, f"cannot be decoded as an image ({first_line(error)[:80]})",
-                         "give PNG, JPEG or TIFF of 8 or 16 bits") from error
+                         SAVE_AS) from error
 
 
 def _has_second_page(picture: Image.Image) -> bool:
@@ -112,14 +117,33 @@ def _has_second_page(picture: Image.Image) -> bool:
 
 
 def _values(picture: Image.Image) -> Picture:
+    """Return the grey values; ValueError for those that Pillow would turn, cut or invert."""
+    stored = str(getattr(picture, "tile", ""))  # before it is decoded
+    tags = getattr(picture, "tag_v2", {})  # of a TIFF
+    bits = max(tags.get(BITS, (0,)))
+    signed = SIGNED in tags.get(SAMPLE_FORMAT, ())
     if picture.mode == "F":
         raise ValueError("floating-point values, whose black and white are unknown")
+    if picture.getexif().get(ORIENTATION, 1) != 1:
+        raise ValueError("its EXIF orientation is not 1: which way up the camera saw is unknown")
+    if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO and bits > 8:
+        raise ValueError("white is 0")
+    if signed and bits <= 8:
+        raise ValueError("signed values")
+    if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[:, :, 3].min() < 255:
+        raise ValueError("transparent pixels")
     if picture.mode not in GREY_MODES:
+        if ";16" in stored:
+            raise ValueError(f"16 bits in the mode {picture.mode}")
         return _grey(np.asarray(picture.convert("RGB")))
+
     values = np.asarray(picture)
     if values.min(initial=0) < 0 or values.max(initial=0) > np.iinfo(np.uint16).max:
         raise ValueError("values beyond 16 bits")
-    return _grey(values.astype(GREY_MODES[picture.mode])[:, :, None])
+    grey = _grey(values.astype(GREY_MODES[picture.mode])[:, :, None])
+    if 8 < bits <= 16:
+        grey = grey._replace(full_scale=(1 << (bits - signed)) - 1)
+    return grey
 
 
 def _grey(values: np.ndarray) -> Picture:

@@ -321,7 +321,7 @@ def test_damaged_files_are_one_line_each(tmp_path, capsys):
     assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
                   "--plan", str(plan)) == 0
     damaged, other_size = capsys.readouterr().err.splitlines()
-    assert f"{files[4].name}: not an image, or damaged; give PNG, JPEG or TIFF" in damaged
+    assert f"{files[4].name}: not an image of a known kind, or damaged; give PNG" in damaged
     assert f"{files[6].name}: 60 x 50 pixels, but earlier images have 72 x 64" in other_size
 
 

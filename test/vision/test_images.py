@@ -3,7 +3,9 @@
 
 import io
 import os
+import struct
 import subprocess
+import zlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,7 +78,7 @@ def test_a_grey_value_of_16_bits_needs_two_bytes():
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(50)])
 def test_what_cannot_be_decoded_is_refused(data):
-    with pytest.raises(InputError, match=r"^f\.png: not an image, or damaged; give PNG"):
+    with pytest.raises(InputError, match=r"^f\.png: not an image of a known kind, or damaged; g"):
         decoded(data, "f.png")
 
 
@@ -90,7 +92,7 @@ def test_no_format_is_decoded_that_needs_a_program(monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", run)
     monkeypatch.setattr(os, "system", run)
     assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (100, 100)  # Pillow would take it
-    with pytest.raises(InputError, match="not an image, or damaged; give PNG, JPEG or TIFF"):
+    with pytest.raises(InputError, match="not an image of a known kind, or damaged; give PNG"):
         decoded(EPS, "f.eps")
 
 
@@ -133,3 +135,76 @@ def test_pages_beyond_the_first_are_told(pages, more):
     first, *others = [Image.fromarray(GREY + 10 * page) for page in range(pages)]
     found = decoded(saved(first, "TIFF", save_all=True, append_images=others), "f.tif")
     assert (found.values == GREY).all() and found.more_pages is more
+
+
+def tiff(values, *tags) -> bytes:
+    """Return a TIFF of one strip, written as its specification says; tags (number, value)."""
+    order, entry = (">", ">HHIHxx") if values.dtype.byteorder == ">" else ("<", "<HHII")
+    data = values.tobytes() + bytes(values.nbytes % 2)
+    height, width = values.shape[:2]
+    entries = {256: width, 257: height, 258: 8 * values.itemsize, 259: 1, 262: 1, 273: 8, 277: 1,
+               278: height, 279: values.nbytes, **dict(tags)}
+    kind = 3 if order == ">" else 4
+    directory = b"".join(struct.pack(entry, tag, kind, 1, value)
+                         for tag, value in sorted(entries.items()))
+    head = struct.pack(f"{order}2sHI", b"II" if order == "<" else b"MM", 42, 8 + len(data))
+    return head + data + struct.pack(f"{order}H", len(entries)) + directory + bytes(4)
+
+
+def png(colour, depth, rows) -> bytes:
+    """Return a PNG of rows of bytes, of 4 pixels, written as its specification says."""
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(
+            ">I", zlib.crc32(name + data))
+    return b"\x89PNG\r\n\x1a\n" + b"".join([
+        chunk(b"IHDR", struct.pack(">IIBBBBB", 4, len(rows), depth, colour, 0, 0, 0)),
+        chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))), chunk(b"IEND", b"")])
+
+
+WIDE = GREY.astype("<u2") * 300
+COLOUR_16 = [np.repeat(row, 3).astype(">u2").tobytes() for row in WIDE]
+GREY_ALPHA_16 = [np.stack([row, 0 * row + 65535], axis=1).astype(">u2").tobytes() for row in WIDE]
+VEILED = np.dstack([GREY, GREY, GREY, GREY + 240])
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_a_tiff_of_16_bits_in_both_orders_of_bytes(order):
+    found = decoded(tiff(WIDE.astype(f"{order}u2")), "f.tif")
+    assert (found.values == WIDE).all() and found.full_scale == 65535
+
+
+def test_the_full_scale_is_that_of_the_bits():
+    twelve = np.array([[0x12, 0x3A, 0xBC], [0xFF, 0xF0, 0x00]], np.uint8)
+    found = decoded(tiff(twelve, (256, 2), (258, 12)), "f.tif")
+    assert found.values.tolist() == [[0x123, 0xABC], [0xFFF, 0]] and found.full_scale == 4095
+    assert decoded(tiff(WIDE, (339, 2)), "f.tif").full_scale == 32767
+
+
+def test_white_is_0_in_8_bits_is_turned_round():
+    assert (decoded(tiff(GREY, (262, 0)), "f.tif").values == 255 - GREY).all()
+
+
+@pytest.mark.parametrize(("data", "problem"), [
+    (tiff(WIDE, (262, 0)), "white is 0"), (tiff(GREY, (339, 2)), "signed values"),
+    (tiff(WIDE - 1, (339, 2)), "values beyond 16 bits"),
+    (tiff(GREY, (274, 6)), "its EXIF orientation is not 1"),
+    (png(2, 16, COLOUR_16), "16 bits in the mode RGB"),
+    (png(4, 16, GREY_ALPHA_16), "16 bits in the mode"),
+    (saved(Image.fromarray(VEILED)), "transparent pixels"),
+    (saved(Image.fromarray(GREY), transparency=3), "transparent pixels")])
+def test_pixels_that_would_be_turned_cut_or_inverted_are_refused(data, problem):
+    with pytest.raises(InputError, match=rf"^f: cannot be decoded as an image \({problem}"):
+        decoded(data, "f")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+def test_every_orientation_but_upright_is_refused(kind):
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[274] = orientation
+        data = saved(Image.fromarray(GREY), kind, exif=exif)
+        if orientation == 1:
+            assert decoded(data, "f").values.shape == (3, 4)
+        else:
+            with pytest.raises(InputError, match="which way up the camera saw is unknown"):
+                decoded(data, "f")
