@@ -223,10 +223,20 @@ class Rewriter:
             self._refuse("the program stops in the line of a move", "stop in the next line")
         if line.code("machine") and (line.named("XY") or not line.code("rapid", "line")):
             self._refuse("G53 leaves the frame of the map", "write G0 or G1, and Z alone")
+        if line.code("home") and not self._printer and line.named("XY"):
+            self._check_way_home(line)
         if line.code("path") and float(line.values.get("Q", line.number("P"))):
             self._refuse("G64 P merges the pieces of corrected lines", "write Q0 behind it")
         if line.code("set E") and not line.values:
             self._refuse("G92 moves the frame", remedy("G92"))
+
+    def _check_way_home(self, line: Line) -> None:
+        """Refuse G28 and G30 by way of a point that is not where the stage is."""
+        distance = line.code("distance")
+        mode = distance.name if distance else self._modes.get("distance")
+        if mode != "G91" or line.number("X") or line.number("Y"):
+            self._refuse("the way home passes a point that is not corrected",
+                         "write G91 with it, and X0, Y0")
 
     def _set_mode(self, code: Code) -> None:
         """Follow a mode."""

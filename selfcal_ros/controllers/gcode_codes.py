@@ -12,7 +12,7 @@ line: G1 XYZ
 arc: G2 G3 XYZIJ
 cancel: G80
 dwell: G4 P
-home: G28 G30 Z
+home: G28 G30 XYZ
 machine: G53
 distance: G90 G91
 unit: G20 G21

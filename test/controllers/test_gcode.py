@@ -51,7 +51,7 @@ N170 X20.
 N180 G80
 N190 G0 X0. Y0. Z5. M5
 N195 G53 G0 Z0
-N196 G91 G28 Z0
+N196 G91 G28 X0 Y0
 N200 G90 G0 X3 Y3 Z1
 N210 G1 X40. Y-20.
 N220 M2
@@ -241,7 +241,9 @@ grbl | +G0 X0 Y0 Z5 // G53 G0 Z0 // G1 X40 Y20 Z1 | 6: Z before this line is not
 grbl | +G38.2 Z0 | 4: G38.2 is not in the list
 grbl | +G53 G0 X0 | 4: G53 leaves the frame of the map; write G0 or G1, and Z alone
 grbl | +G53 G2 X1 I1 | 4: G53 leaves the frame
-grbl | +G91 G28 X0 | 4: X is not a word of G91 G28
+grbl | +G28 X0 Y0 | 4: the way home passes a point
+grbl | +G91 // G90 G28 X0 | 5: the way home
+grbl | +G91 G28 X0 Y1 | 4: the way home passes a point that is not corrected; write G91
 grbl | +G54 // G0 X0 Y0 // G55 | 6: G55 follows a move in X or Y; set the frame before
 linuxcnc | +G43 H1 // G0 X0 Y0 // G43 H2 | 6: G43 follows a move in X or Y
 grbl | +G0 X0 Y0 // G20 | 5: G20 follows a move in X or Y
