@@ -13,7 +13,7 @@ from test.support.pages import PAGES, ROOT, code_lines
 
 COMMAND = re.compile(r"^ *(?:\.venv/bin/)?(selfcal [a-z][^\n`]*?)(?: *# ?(.*))?$", re.M)
 FILES = (re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S),
-         re.compile(r"```\w+ (\w+\.\w+)\n(.*?)```", re.S))
+         re.compile(r"```\w+ title=\"(\w+\.\w+)\"\n(.*?)```", re.S))
 ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
     "replay": "run by test/nodes/test_replay.py",
