@@ -76,7 +76,7 @@ pictures: setup  ## the pictures of README and docs
 docs: setup  ## the documentation as a site, build/site
 	@test -e build/mkdocs/.complete || { $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--upgrade --target build/mkdocs mkdocs-material==9.6.14 "mkdocs<2" && touch build/mkdocs/.complete; }
-	@PYTHONPATH=build/mkdocs $(BIN)/python -m mkdocs build --quiet
+	@PYTHONPATH=build/mkdocs $(BIN)/python -m mkdocs build --strict
 map3d:  ## the script of the turning map in reports; needs npm
 	@cd tools/map3d && npm ci --silent && npm run --silent build
 reference: setup  ## docs/reference/reference.md and config/params/all.yaml from the code

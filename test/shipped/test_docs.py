@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
+from test.support.pages import PAGES
 
 ROOT = Path(__file__).parents[2]
 BAGS = (ROOT / "docs/reference/bags.md").read_text()
@@ -53,3 +54,16 @@ def test_every_equation_that_the_code_cites_exists():
             for number in filter(None, (first, last)):
                 assert number in numbers, f"{path.name}: method eq. {number}"
     assert cited > 20
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_the_site_reads_a_page_as_github_does(page):
+    """Python-Markdown shows a fence of two words, or a list right below a line, as it stands."""
+    within_fence, above = False, ""
+    for line in page.read_text().splitlines():
+        if line.lstrip().startswith("```"):
+            assert within_fence or re.fullmatch(r' *```(\w+( title="[\w.]+")?)?', line), line
+            within_fence = not within_fence
+        begins_list = re.match(r"(-|\d\.) ", line) and not within_fence
+        assert not begins_list or re.match(r"$|(-|\d\.) | +", above), f"no line above {line}"
+        above = line
