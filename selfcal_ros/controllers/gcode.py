@@ -23,7 +23,7 @@ from selfcal_ros.units import M_PER_INCH, M_PER_MM
 
 VALUE = r"([-+]?(?:\d+\.?\d*|\.\d+))"
 WORD = re.compile(rf"([A-Za-z])[ \t]*{VALUE}|(;.*|\([^()]*\))|[ \t]+", re.ASCII)
-PRINTER_WORD = re.compile(rf"([A-Z]){VALUE}?|(;.*)|[ \t]+", re.ASCII)
+PRINTER_WORD = re.compile(rf"([A-Z]){VALUE}?|(;.*)| +", re.ASCII)
 """Letter, value and comment."""
 CONTROL = r"[\x00-\x08\x0a-\x1f\x7f]"
 FORBIDDEN = {"linuxcnc": rf"{CONTROL}|[(;]\s*(?i:py|abort)", "grbl": r"[!?~]|[^ -~\t]"}
@@ -170,7 +170,7 @@ class Rewriter:
         pattern = PRINTER_WORD if self._printer else WORD
         left = pattern.sub("", text)
         if left:
-            self._refuse(f"'{left[0]}' does not belong to a word of {self.dialect}",
+            self._refuse(f"{left[0]!r} does not belong to a word of {self.dialect}",
                          remedy(left[0].upper()))
         line = Line([], {}, [])
         for letter, value, comment in pattern.findall(text):
@@ -207,7 +207,7 @@ class Rewriter:
         names = " ".join(code.name for code in line.codes)
         acts = [code for code in line.codes if code.does in ACTS]
         modes = [code.does for code in line.codes if code.does in MODES]
-        crowded = self._printer and len(line.codes) > 1
+        crowded = len(line.codes) > 1 and (self._printer or bool(acts and "path" in modes))
         if crowded or len(acts) > 1 or len(modes) > len(set(modes)):
             self._refuse(f"{names} in one line", "write a line for each")
         known = "".join(code.words for code in line.codes) + ALWAYS * (not self._printer)

@@ -286,6 +286,7 @@ grbl | +G0 X0 Y0 // G2 X10 I5 P2 | 5: P is not a word of G2; write each repeat, 
 grbl | +G1 X5 Y5 | 4: the position before this line is not known
 marlin | +G1 X5 Y5 E1 | 4: the position before this line is not known
 marlin | +G0 X0 Y0 // G1 X40 Y20 E1 | 5: E before this line is not known
+linuxcnc | +G61 // G0 X0 Y0 // G2 I5 G64 P0.01 Q0 | 6: G2 G64 in one line; write a line
 marlin | G21 G90 | 1: G21 G90 in one line
 marlin | X5 | 1: the line does not
 marlin | X5 G1 | 1: the line does not begin
@@ -305,7 +306,8 @@ klipper | G1 X5 (a) | 1: '(' does
 """
 """Dialect, program (+: its modes are said; //: end of line), line and reason."""
 CASES = [tuple(part.strip() for part in row.split(" | ")) for row in REFUSED.strip().splitlines()]
-CASES += [("grbl", "(\u212a)", "1: '\u212a' acts on grbl even in"),
+CASES += [("marlin", "\tG1 X5", "1: '\\t' does not belong to a word of marlin"),
+          ("grbl", "(\u212a)", "1: '\u212a' acts on grbl even in"),
           ("marlin", "; a\rG1 X5", "1: '\\r' acts"),
           ("grbl", f"+G0 X0 Y0\nG1 X9 F{'0' * 70}9", "5: the corrected line is too long")]
 BEFORE = dict.fromkeys(("grbl", "linuxcnc"), "G21 G90\nG17\nF9\n") | dict.fromkeys(
