@@ -117,8 +117,7 @@ class McapStream:
                 elif not self.begin:
                     raise self._refusal(head + file.read(len(SQLITE)))
                 else:
-                    self.lost.append(f"{self._size - self.begin} bytes after the end of the "
-                                     "recording are not MCAP and were not used")
+                    self._pass_strange(file)
         except OSError as error:
             raise InputError(str(self.path), f"cannot be read ({error.strerror})",
                              "name a readable file") from error
@@ -129,6 +128,16 @@ class McapStream:
         if self._n_read < self._n_written:
             self.lost.append(f"{self._n_written - self._n_read} of {self._n_written} messages of "
                              "the file are lost")
+
+    def _pass_strange(self, file: BinaryIO) -> None:
+        """Say what follows a recording and is not MCAP, up to the next one."""
+        with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
+            joint = data.find(mcap_chunk.MAGIC, self.begin)
+        end = self._size
+        if joint >= 0:
+            end = self.rest = joint
+        self.lost.append(f"{end - self.begin} bytes after the end of the recording are not MCAP "
+                         "and were not used")
 
     def _refusal(self, head: bytes) -> InputError:
         """Return the problem of a file that is not MCAP, by its first bytes."""

@@ -102,9 +102,11 @@ class BagReader:
                         if name.removesuffix(".zstd") not in there - {name}), key=_natural)
         listed = self._listed()
         names = listed if there.intersection(listed) else found  # the files may have been renamed
+        instead = ", ".join(name for name in names if name not in listed)
         for name in listed:
             if name not in there:
-                self.lost.append(f"the file {name}, which metadata.yaml lists, is missing")
+                self.lost.append(f"the file {name}, which metadata.yaml lists, is missing"
+                                 + (f"; {instead} was read" if instead else ""))
         plain = {name.removesuffix(".zstd") for name in names}
         for name in found:
             if name.removesuffix(".zstd") not in plain:
@@ -114,7 +116,9 @@ class BagReader:
         if not files and any(p.suffix == ".db3" for p in self.path.iterdir()):
             raise InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         if not files:
-            raise InputError(str(self.path), "no .mcap file in this folder",
+            missing = f"; {', '.join(listed)}, which metadata.yaml lists, is missing"
+            raise InputError(str(self.path), "no .mcap file in this folder"
+                             + missing * bool(listed),
                              "give an MCAP file or a rosbag2 folder with MCAP storage")
         return files
 
@@ -189,7 +193,8 @@ class BagReader:
         """Yield the blocks of all files; an unreadable file is skipped if another is readable."""
         refused: list[InputError] = []
         for file in self.files:
-            for stream in streams([file], self.lost, lambda topic: bool(_roles(topic))):
+            lost: list[str] = []
+            for stream in streams([file], lost, lambda topic: bool(_roles(topic))):
                 try:
                     for block in stream.blocks():
                         yield stream, block
@@ -199,14 +204,17 @@ class BagReader:
                 for channel in stream.channels.values():
                     schema = stream.schemas.get(channel.schema_id)
                     self.topics[channel.topic] = schema.name if schema else ""
+            name = f"{file.name}: " if len(self.files) > 1 else ""
+            self.lost += [name + line for line in lost]
         if len(refused) == len(self.files):
             raise refused[0]
 
     def _blocks(self, bad: Counter,
                 ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
-        watches = {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
+        watches = self._watches()
         decoders: dict[tuple[Path, int, int], ChannelDecoder | None] = {}
+        latest_ns, part = 0, None
         for stream, block in self._streams():
             parts = []
             for number in block.channels():
@@ -217,11 +225,33 @@ class BagReader:
                 if decoder is not None:
                     parts.append((decoder, self._in_time(decoder.role, block, np.flatnonzero(
                         block.fronts["channel"] == number))))
+            used = [index for _, index in parts if len(index)]
+            if used:
+                logged_ns = block.fronts["log_time"][np.concatenate(used)]
+                begins = (stream.path, stream.begin) != part
+                if begins and self._overlaps(stream, latest_ns - int(logged_ns.min())):
+                    watches = self._watches()
+                part = (stream.path, stream.begin)
+                latest_ns = max(latest_ns, int(logged_ns.max()))
             for decoder, index in parts:
                 if decoder.role in watches:
                     self._note_steps(watches[decoder.role], decoder.role, block[
                         index[::_stride(index)]])
             yield block, parts
+
+    def _watches(self) -> dict[str, StepWatch]:
+        return {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
+
+    def _overlaps(self, stream: McapStream, by_ns: int) -> bool:
+        """Return whether a recording begins before the end of those before it, and say so."""
+        if by_ns <= self.clock_limit_s * NS_PER_S:
+            return False
+        where = f" from byte {stream.begin} on" if stream.begin else ""
+        self.lost.append(f"{stream.path.name}{where} begins {by_ns / NS_PER_S:.3g} s before the "
+                         "end of what was read before it: a copy, files in another order than "
+                         "they were recorded in, or a clock that stepped back; each reading "
+                         "counts once")
+        return True
 
     def _in_time(self, role: str, block: Block, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""

@@ -158,6 +158,34 @@ def test_what_follows_the_end_of_a_file_and_is_no_other_is_said(tmp_path, events
     assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
 
 
+def test_a_recording_behind_strange_bytes_is_read(tmp_path, events, expected):
+    one, two = (Foreign().write(tmp_path / f"{number}.mcap", part, order=number).read_bytes()
+                for number, part in enumerate(bags.split(events, 2)))
+    (tmp_path / "bag.mcap").write_bytes(one + bytes(50) + two)
+    result, lost = solved(tmp_path / "bag.mcap")
+    assert result == expected
+    assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
+
+
+@pytest.mark.parametrize(("order", "where"), [
+    ([0, 0], "b.mcap"), ([1, 0], "b.mcap"), ([0, 1], ""), ("joined", "a.mcap from byte")])
+def test_copies_and_files_out_of_order_are_not_called_steps_of_a_clock(
+        tmp_path, events, expected, order, where):
+    halves = [events, events] if order in ([0, 0], "joined") else bags.split(events, 2)
+    names = "ab" if order != [1, 0] else "ba"
+    (tmp_path / "bag").mkdir()
+    files = [Foreign().write(tmp_path / "bag" / f"{name}.mcap", half)
+             for name, half in zip(names, halves, strict=True)]
+    if order == "joined":
+        files[0].write_bytes(files[0].read_bytes() + files[1].read_bytes())
+        files[1].unlink()
+    measurements, _, lost, _ = collect_bag(tmp_path / "bag", VALUES)
+    assert calibrated(measurements)["error_map"] == expected["error_map"]
+    assert len(lost) == bool(where)
+    for line in lost:
+        assert line.startswith(where) and "before the end of what was read before it" in line
+
+
 def listing(bag, *files) -> None:
     (bag / "metadata.yaml").write_text(yaml.safe_dump(
         {"rosbag2_bagfile_information": {"relative_file_paths": list(files)}}))
@@ -177,7 +205,25 @@ def test_files_that_were_renamed_are_read(tmp_path, events, expected):
     listing(tmp_path / "bag", "a.mcap")
     result, lost = solved(tmp_path / "bag")
     assert result == expected
-    assert lost == ["the file a.mcap, which metadata.yaml lists, is missing"]
+    assert lost == ["the file a.mcap, which metadata.yaml lists, is missing; renamed.mcap was read"]
+
+
+def test_the_missing_files_of_a_bag_without_any_are_named(tmp_path):
+    (tmp_path / "bag").mkdir()
+    listing(tmp_path / "bag", "a_0.mcap", "a_1.mcap")
+    with pytest.raises(InputError, match=r"no \.mcap file in this folder; a_0\.mcap, a_1\.mcap, "
+                       "which metadata.yaml lists, is missing"):
+        BagReader(tmp_path / "bag")
+
+
+def test_a_damaged_file_of_several_is_named(tmp_path, events):
+    for name, part in zip("ab", bags.split(events, 2), strict=True):
+        Foreign().write(tmp_path / "bag" / f"{name}.mcap", part)
+    cut = tmp_path / "bag" / "b.mcap"
+    cut.write_bytes(cut.read_bytes()[:-9])
+    reader = BagReader(tmp_path / "bag")
+    list(decoded(reader))
+    assert len(reader.lost) == 1 and reader.lost[0].startswith("b.mcap: the end of the file is dam")
 
 
 def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, expected):
