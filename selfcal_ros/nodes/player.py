@@ -78,7 +78,8 @@ class Player:
         self._began: float | None = None
         self._published_s = 0.0  # last time that a message was sent, or none was due
         self._before = 0  # messages received by the listener before the first of these
-        self.alone_on = [] if beside_others else [*self._publishers]
+        self.alone_on = [] if beside_others else [
+            *self._publishers, *([DETECTION_TOPIC] if images else [])]
         self._own = [node.get_fully_qualified_name(), *(f"{own}/{name}" for name in (
             SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE))]
         self._own += [self.detector] if images else []
@@ -158,7 +159,7 @@ class Player:
         """
         self._looked_s = time.monotonic()
         looked_s = self._looked_s - self._created_s
-        others = others_on(self.node, self.alone_on, self._own)
+        others = self._others()
         named = {other: topics for other, topics in others.items()
                  if not other.endswith(UNNAMED) or looked_s > NAME_S}
         for other, topics in named.items():
@@ -167,6 +168,19 @@ class Player:
                 f"{other} publishes {', '.join(topics)} as well; {self._at} messages were played",
                 "end it, or play in another ROS domain")
         return not others and (looked_s >= LOOK_S or not self.alone_on)
+
+    def _others(self) -> dict[str, list[str]]:
+        """Return who else publishes on which topics; selfcal's nodes may, on topics of their own.
+
+        A node of that name on another topic is somebody else's.
+        """
+        found: dict[str, list[str]] = {}
+        for topic in self.alone_on:
+            played = topic in self._publishers and topic != COMMAND_TOPIC
+            own = self._own[:1] if played else self._own
+            for other, topics in others_on(self.node, [topic], own).items():
+                found.setdefault(other, []).extend(topics)
+        return found
 
     def step(self) -> None:
         """Publish the messages due now.

@@ -215,6 +215,17 @@ def test_nothing_is_played_beside_somebody_elses_publisher(graph, bag):
     assert level == Level.ERROR and DRIVER in line
 
 
+def test_a_node_named_as_one_of_selfcal_is_a_stranger_on_what_is_played(graph, bag):
+    graph.add(Node("measurement_collector", context=graph.context)).create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
+    lines: list = []
+    player.say = lambda level, line: lines.append(line)
+    graph.until(player.finished.done, "its end")
+    assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 0)
+    assert DRIVER.replace("hand", "measurement_collector") in lines[0]
+
+
 def test_a_bag_is_played_beside_others_where_that_is_asked_for(graph, bag):
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", beside_others=True)
