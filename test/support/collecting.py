@@ -3,6 +3,7 @@
 
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -68,16 +69,28 @@ def scene(text: str | Plan = "0", *, size: int = 5, count: int = 8, line: bool =
 
 
 def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
-    """Return a collector that has taken all events in their order."""
+    """Return a collector that has taken all events in their order, alike ones in blocks."""
     collector = Collector(CollectorSettings.checked(parameters, "test"))
-    for event in events:
-        if isinstance(event, Command):
-            collector.add_command(event)
-        elif isinstance(event, Detection):
-            collector.add_detection(event)
+    for (kind, *joints), alike in groupby(events, _alike):
+        if kind is Command:
+            for command in alike:
+                collector.add_command(command)
+        elif kind is Detection:
+            collector.add_detection_block(np.array([*map(astuple, alike)], dtype=DETECTION))
         else:
-            collector.add_encoder(event)
+            samples = [*alike]
+            collector.add_encoder_block(
+                np.array([s.stamp_ns for s in samples]), joints[0],
+                np.array([s.positions for s in samples], dtype=float),
+                np.array([s.velocities for s in samples], dtype=float))
     return collector
+
+
+def _alike(event: Event) -> tuple:
+    """Return what messages of one block have in common."""
+    if not isinstance(event, EncoderSample):
+        return (type(event),)
+    return type(event), event.names, len(event.positions), len(event.velocities)
 
 
 def collect(events: Iterable[Event], **parameters: Any,

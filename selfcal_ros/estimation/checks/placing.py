@@ -17,6 +17,7 @@ were named.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -337,10 +338,10 @@ class _Kept:
         kept = np.flatnonzero(~tried)
         self.beside, self.own = stage[np.ix_(kept, tried)], stage[np.ix_(tried, tried)]
         self.views = [seen for number, seen in enumerate(views) if number not in moved]
-        factor = np.linalg.cholesky(self._covariance(
+        self.factor = np.linalg.cholesky(self._covariance(
             self.views, self.views, stage[np.ix_(kept, kept)]))
-        self.sizes, self.whiten = np.diag(factor).real, np.linalg.inv(factor)
-        self.white = self.whiten @ self._columns(self.views, 0)
+        self.sizes = np.diag(self.factor).real
+        self.white = np.linalg.solve(self.factor, self._columns(self.views, 0))
 
     def with_moved(self, moved: list[_Seen]) -> tuple[float, float]:
         """Return the likelihood of all readings with those of the others at these poses."""
@@ -358,6 +359,11 @@ class _Kept:
         likelihood = (-square / 2 - 2 * np.log(sizes).sum()
                       - np.linalg.slogdet(inner[:, :-1])[1])
         return float(likelihood), float(square / 2 / (len(white) - self.free))
+
+    @cached_property
+    def whiten(self) -> np.ndarray:
+        """What makes the readings that stay independent, with unit noise, complex (n, n)."""
+        return np.linalg.inv(self.factor)
 
     def _covariance(self, some: list[_Seen], others: list[_Seen], stage: np.ndarray) -> np.ndarray:
         """Return the covariance of readings, `stage` that of the stage's errors in them."""

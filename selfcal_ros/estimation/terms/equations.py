@@ -724,24 +724,26 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
                        noise: tuple[float, float], *, rows: np.ndarray, among: int) -> SizeTest:
     """Return the test of a size by the coefficients `rows`, bool (p,), one of `among` tests."""
     sigma, dof = noise
-    values, variance, of_size = _told(equations, right, rows, sigma)
+    values, information, of_size = _told(equations, right, rows, sigma)
     rank = len(values)
-
-    def spread(size: float) -> np.ndarray:
-        return np.diag(variance) + size**2 * of_size
-
-    def statistic(size: float) -> float:
-        return float(values @ np.linalg.solve(spread(size), values))
-
     if not rank:
         return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
+    root = np.sqrt(information)
+    of_unit, turn = np.linalg.eigh(root[:, None] * of_size * root)  # in independent combinations
+    squares = (turn.T @ (root * values)) ** 2
+
+    def variances(size: float) -> np.ndarray:
+        return sigma**2 + size**2 * of_unit
+
+    def statistic(size: float) -> float:
+        return float((squares / variances(size)).sum())
+
     found = statistic(term.size)
     p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
     test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p, min(1.0, among * p))
     if not test.raised:
         return test
-    # b'b / (size^2 the smallest eigenvalue) is not below it
-    beyond = np.sqrt(values @ values / np.linalg.eigvalsh(of_size)[0])
+    beyond = np.sqrt((squares / of_unit).sum())  # the statistic is below its square / size^2
 
     def size_at(level: float) -> float:
         low, high = term.size, float(beyond / np.sqrt(level))
@@ -752,7 +754,7 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
 
     tail = TAIL if test.contradicted else DOUBT_LEVEL
     shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
-    wider = np.linalg.slogdet(spread(shown))[1] - np.linalg.slogdet(spread(term.size))[1]
+    wider = float(np.log(variances(shown) / variances(term.size)).sum())
     return replace(test, shown=shown, allowed=allowed,
                    evidence=float(found - statistic(shown) - wider) / 2)
 
@@ -761,8 +763,8 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the estimates of coefficients taken as free.
 
-    The determined combinations, scaled by the columns' norms, (r,), their variances from the
-    noise, (r,), and their covariance for a largest size of 1, (r, r).
+    The determined combinations, scaled by the columns' norms, (r,), the information on them for
+    unit noise, (r,), and their covariance for a largest size of 1, (r, r).
     """
     rest = ~rows
     prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
@@ -779,7 +781,7 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     values = vectors.T @ (scores[rows] - couple @ scores[rest]) / size
     own = equations.columns.size[rows]
     turned = vectors * (norm[rows] * own / own.max())[:, None]
-    return values, sigma_m**2 / size, turned.T @ turned
+    return values, size, turned.T @ turned
 
 
 def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
