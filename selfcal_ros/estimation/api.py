@@ -171,10 +171,9 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
     def solution(wiring: Turned) -> tuple[Solved, Measurements] | None:
         turned = turned_readings(measurements, wiring)
         try:
-            solved = solve_joint(turned, options)
+            return solve_joint(turned, options, whole_only=True), turned
         except NotSettledError:
             return None
-        return (solved, turned) if solved.converged else None
 
     def agree(wiring: Turned, options: Options) -> bool:
         if (found := solution(wiring)) is None:

@@ -336,15 +336,22 @@ UNASKED_SITES = 201 * 201
 """Largest field of which the uncertainty is given unasked: a second, beyond it takes many."""
 
 
-def solve_joint(measurements: Measurements, options: Options) -> Solved:
+def solve_joint(measurements: Measurements, options: Options, *,
+                whole_only: bool = False) -> Solved:
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`.
 
     Readings so far from what is assumed of them that the estimate does not converge are solved
     without the assumptions, and cannot be qualified. Where nothing but rounding is left no
     assumption can be weighed against it: what the views determine by themselves is enough.
+
+    Raises
+    ------
+    NotSettledError
+        If the estimate does not converge; with `whole_only` as soon as it does not with all that is
+        assumed.
     """
     with one_thread():
-        model, seen, whole = _fitted(measurements, options)
+        model, seen, whole = _fitted(measurements, options, whole_only=whole_only)
         return replace(_solved(measurements, options, model=model, seen=seen),
                        converged=whole or model.found.xy.sigma < LEAST_NOISE_M)
 
@@ -355,12 +362,12 @@ def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
         return _fitted(measurements, options)[0]
 
 
-def _fitted(measurements: Measurements,
-            options: Options) -> tuple[ModelFit, Observability, bool]:
+def _fitted(measurements: Measurements, options: Options, *,
+            whole_only: bool = False) -> tuple[ModelFit, Observability, bool]:
     """Return the fit, what the readings determine, and if it has all that is assumed.
 
     Where that does not converge with the places of the stage readings count for their sites, and
-    then less is assumed.
+    then less is assumed, unless it is `whole_only` that counts.
     """
     of_visits = tuple(term for term in options.assumed if term.block.needs_visits)
     failed: NotSettledError | None = None
@@ -371,6 +378,8 @@ def _fitted(measurements: Measurements,
                 model = fit_model(replace(problem, at_places=at_places),
                                   partial(require_terms_told, seen=seen))
             except NotSettledError as error:
+                if whole_only:
+                    raise
                 failed = error
                 continue
             return model, seen, assumed == options.assumed and at_places == problem.moves
