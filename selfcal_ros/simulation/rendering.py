@@ -7,7 +7,7 @@ each pixel; the detector's models are not used.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import groupby
 
 import numpy as np
@@ -134,13 +134,15 @@ class Camera:
         for _ in range(rng.poisson(self.dirt) if self.dirt else 0):
             u, v = rng.uniform(0, self.width), rng.uniform(0, self.height)
             self._speck(grey, u, v, 2 * size * rng.uniform(*DIRT_RADIUS))
-        light = np.clip(grey, 0.0, None) * self._lighting()
+        light = np.clip(grey, 0.0, None) * self._lighting
         spread = np.sqrt(self.read_noise ** 2 + self.shot_noise ** 2 * light)
         value = (light + spread * rng.normal(size=light.shape)) * self.full_scale
         return np.clip(np.rint(value), 0, self.full_scale).astype(
             np.uint16 if self.encoding == "mono16" else np.uint8)
 
+    @cached_property
     def _lighting(self) -> np.ndarray:
+        """Share of the light that reaches each pixel, (height, width)."""
         v, u = np.mgrid[0:self.height, 0:self.width]
         right, down = u - (self.width - 1) / 2, v - (self.height - 1) / 2
         return 1 - self.vignetting * (right ** 2 + down ** 2) / (
@@ -167,10 +169,13 @@ class Camera:
         if rows.start >= rows.stop or columns.start >= columns.stop:
             return
         step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
-        b, a = np.meshgrid(step - (v - row), step - (u - column), indexing="ij")
+        b, a = step - (v - row), step - (u - column)
         a = -a if self.mirror else a
         cosine, sine = np.cos(angle), np.sin(angle)  # from columns to rows
-        cover = np.clip(0.5 + FINE * inside(cosine * a + sine * b, cosine * b - sine * a), 0, 1)
+        cover = inside(np.add.outer(sine * b, cosine * a), np.subtract.outer(cosine * b, sine * a))
+        cover *= FINE
+        cover += 0.5
+        np.clip(cover, 0, 1, out=cover)
         along = blurred_pixels(2 * half + 1, self.blur_px)
         pixels = along @ cover @ along.T
         grey[rows, columns] += contrast * pixels[
@@ -210,9 +215,9 @@ def distance(mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float)
     A corner is where two squares of side `size` meet.
     """
     if mark == "disc":
-        return size / 2 - np.hypot(a, b)
+        return size / 2 - np.sqrt(a * a + b * b)  # hypot takes four times as long
     if mark == "ring":
-        return width / 2 - np.abs(np.hypot(a, b) - (size - width) / 2)
+        return width / 2 - np.abs(np.sqrt(a * a + b * b) - (size - width) / 2)
     if mark == "cross":
         return np.maximum(_box(a, b, size, width), _box(a, b, width, size))
     return np.maximum(_box(a - size / 2, b - size / 2, size, size),
