@@ -15,7 +15,7 @@ import numpy as np
 from mcap.records import Channel, Message, Schema
 
 from selfcal_ros.bagio.mcap_stream import streams
-from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.reader import CLOCK_LIMIT_S, BagReader, overlap
 from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
@@ -310,14 +310,22 @@ class ImageBag:
         Raises
         ------
         InputError
-            If the topic of the images has another type.
+            If the topic of the images has another type, or a recording begins before the end of
+            those before it.
         """
         lines: list[str] = []
+        latest_ns = 0
         for stream in streams(self._files, lines):
+            before_ns = latest_ns
             for channel, message in stream.messages():
                 schema = stream.schemas.get(channel.schema_id)
                 item = Item(channel, schema, message, bool(self._transport(channel.topic)))
                 if channel.topic == self.topic:
+                    by_ns = before_ns - message.log_time
+                    if by_ns > CLOCK_LIMIT_S * NS_PER_S:
+                        raise InputError(str(self.path), overlap(stream, by_ns), "give each "
+                                         "recording once, in the order in which they were made")
+                    latest_ns = max(latest_ns, message.log_time)
                     item.image = self._decoded(channel, schema, message)
                 yield item
         self.lost.update(lines)

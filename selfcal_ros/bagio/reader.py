@@ -228,8 +228,9 @@ class BagReader:
             used = [index for _, index in parts if len(index)]
             if used:
                 logged_ns = block.fronts["log_time"][np.concatenate(used)]
-                begins = (stream.path, stream.begin) != part
-                if begins and self._overlaps(stream, latest_ns - int(logged_ns.min())):
+                by_ns = latest_ns - int(logged_ns.min())
+                if (stream.path, stream.begin) != part and by_ns > self.clock_limit_s * NS_PER_S:
+                    self.lost.append(f"{overlap(stream, by_ns)}; each reading counts once")
                     watches = self._watches()
                 part = (stream.path, stream.begin)
                 latest_ns = max(latest_ns, int(logged_ns.max()))
@@ -241,17 +242,6 @@ class BagReader:
 
     def _watches(self) -> dict[str, StepWatch]:
         return {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
-
-    def _overlaps(self, stream: McapStream, by_ns: int) -> bool:
-        """Return whether a recording begins before the end of those before it, and say so."""
-        if by_ns <= self.clock_limit_s * NS_PER_S:
-            return False
-        where = f" from byte {stream.begin} on" if stream.begin else ""
-        self.lost.append(f"{stream.path.name}{where} begins {by_ns / NS_PER_S:.3g} s before the "
-                         "end of what was read before it: a copy, files in another order than "
-                         "they were recorded in, or a clock that stepped back; each reading "
-                         "counts once")
-        return True
 
     def _in_time(self, role: str, block: Block, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""
@@ -311,6 +301,14 @@ class BagReader:
                                  "choose one with --namespace")
             return role
         return None
+
+
+def overlap(stream: McapStream, by_ns: int) -> str:
+    """Say that a recording begins before the end of those that were read before it."""
+    where = f" from byte {stream.begin} on" if stream.begin else ""
+    return (f"{stream.path.name}{where} begins {by_ns / NS_PER_S:.3g} s before the end of what was "
+            "read before it: a copy, files in another order than they were recorded in, or a clock "
+            "that stepped back")
 
 
 def _stride(index: np.ndarray) -> int:

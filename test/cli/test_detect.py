@@ -185,6 +185,16 @@ def test_impossible_requests_end_with_one_line(bag, tmp_path, capsys, arguments,
     assert not (tmp_path / "found").exists()
 
 
+def test_a_recording_that_is_in_the_bag_twice_is_refused(bag, tmp_path, capsys):
+    [file] = bag.glob("*.mcap")
+    (tmp_path / "twice.mcap").write_bytes(2 * file.read_bytes())
+    assert detect(tmp_path / "twice.mcap", tmp_path / "out") == 2
+    err = capsys.readouterr().err
+    assert re.search(r"twice\.mcap from byte \d+ on begins \S+ s before the end of what was read "
+                     r"before it: a copy, .*; give each recording once", err)
+    assert err.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
 def test_parameters_come_from_a_file_of_the_nodes(bag, tmp_path):
     (tmp_path / "nodes.yaml").write_text(
         "mark_detector: {ros__parameters: {pixel_size: 3.0e-6, mark_size: 60.0e-6, turn: 30.0,"
