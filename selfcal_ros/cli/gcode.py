@@ -2,6 +2,7 @@
 """``selfcal gcode``: a program for a controller without tables, corrected."""
 
 import argparse
+import math
 import sys
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from selfcal_ros.controllers.gcode_codes import DIALECTS
 from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
+from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.units import M_PER_UM
 
@@ -37,6 +39,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_frame(parser, theta=False, units=("mm", "in"))
 
 
+def step_of(error_map: ErrorMap, tolerance_m: float) -> float:
+    """Return the distance of points between which a bend of the map is an eighth of a tolerance.
+
+    Where cells meet, the slope of the interpolated map changes by its second difference over the
+    pitch. A line between points h apart is off that bend by at most a quarter of the change times
+    h, for two components and two bends together.
+    """
+    bend_m = max(float(np.nanmax(np.abs(np.diff(part, 2, axis)), initial=0.0))
+                 for part in (error_map.gx, error_map.gy) for axis in (0, 1))
+    pitch_m = error_map.artifact.grid_pitch_m
+    share = tolerance_m / 8 * 4 / (2 * math.sqrt(2) * max(bend_m, 1e-12))
+    return pitch_m * min(1 / 32, share)
+
+
 def run(args: argparse.Namespace) -> int:
     """Read program and result, write the program; code 5 and the reason if not qualified."""
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
@@ -49,11 +65,10 @@ def run(args: argparse.Namespace) -> int:
     frame = replace(frame_of(args), unit="m")
     check_outputs([args.program, args.result], [file_of(args)])
     result, filled = ready(args)
-    plate = result.artifact
     rewriter = Rewriter(
         wanted(result.error_map, Wiring(frame)), dialect=args.dialect,
-        tolerance_m=args.tolerance * M_PER_UM, step_m=plate.grid_pitch_m / 32,
-        decimals=args.decimals)
+        tolerance_m=args.tolerance * M_PER_UM,
+        step_m=step_of(result.error_map, args.tolerance * M_PER_UM), decimals=args.decimals)
     text = read_text(args.program)
     if not text.strip():
         raise InputError(args.program, "the file is empty", "name a G-code program")

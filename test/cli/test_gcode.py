@@ -2,13 +2,17 @@
 """``selfcal gcode`` from the command line."""
 
 import json
+import math
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
+from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -69,6 +73,26 @@ def test_what_is_not_possible_is_one_line(capsys, line, message):
     err = capsys.readouterr().err
     assert err.startswith(f"selfcal gcode: {message}") and err.count("\n") == 1
     assert not Path("o.nc").exists()
+
+
+@pytest.mark.parametrize(("gain", "um"), [(20, 0.05), (400, 1.0)])
+def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(gain, um, capsys):
+    """Errors of up to 0.2 mm that change from site to site, on ways across many cells."""
+    bent = random_map(Artifact(11, 0.01), 4, gain=gain)
+    write_json("R.json", result_to_dict(result_of(bent)))
+    stage, worst = Compensator(bent), 0.0
+    for begin, end in [((-41, -33), (44, 39)), ((-45, 20), (43, 9)), ((12, -40), (-7, 44))]:
+        Path("in.nc").write_text(f"{SAID}G0 X{begin[0]} Y{begin[1]}\nG1 X{end[0]} Y{end[1]} F9\n")
+        assert run(f"in.nc R.json -o - --decimals 7 --tolerance {um} --steep") == 0
+        words = re.findall(r"X(\S+) Y(\S+)", capsys.readouterr().out)
+        points = np.array(words, float) * 1e-3
+        way = np.concatenate([a + np.linspace(0, 1, 200)[:, None] * (b - a)
+                              for a, b in pairwise(points)])
+        way = np.stack(stage.correct(*way.T), axis=1)
+        along = np.subtract(end, begin) / math.dist(begin, end)
+        across = (way - np.multiply(begin, 1e-3)) @ [-along[1], along[0]]
+        worst = max(worst, np.abs(across).max())
+    assert 0.5e-6 * um < worst < 1.02e-6 * um
 
 
 def test_not_qualified_is_code_5(capsys):
