@@ -51,6 +51,7 @@ from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, reduce_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
+from selfcal_ros.estimation.verdict.leverage import noise_of
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
@@ -283,13 +284,6 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
 def _of_terms(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the effect of coefficients (p, k) on the readings, complex (k, views, nx, ny)."""
     return np.array([np.tensordot(one, columns, axes=1) for one in coefficients.T])
-
-
-def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
-    """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
-    root = np.sqrt(np.where(weight > 0, weight, 1.0))
-    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
-    return both[0] + 1j * both[1]
 
 
 def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator

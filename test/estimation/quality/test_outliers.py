@@ -10,14 +10,12 @@ from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
-from selfcal_ros.estimation.quality import outliers
-from selfcal_ros.estimation.quality.outliers import (
+from selfcal_ros.estimation.quality.outliers import by_repeats, clean, residuals_of
+from selfcal_ros.estimation.verdict import leverage
+from selfcal_ros.estimation.verdict.leverage import (
     angular_redundancy,
-    by_repeats,
-    clean,
     drawn_redundancy,
     exact_leverage,
-    residuals_of,
 )
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import OUTLIER, GridVisits, Sense, ViewReadings, subset, without
@@ -94,7 +92,7 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
 def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkeypatch):
     _, readings = measured(missing=0.1)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(outliers, "EXACT_LINES", 0)
+    monkeypatch.setattr(leverage, "EXACT_LINES", 0)
     assert angular_redundancy(system).sum() == pytest.approx(
         system.angular.n_readings - system.rank_angular, rel=1e-9)
 
@@ -102,7 +100,7 @@ def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkey
 def test_drawn_and_exact_redundancies_agree(monkeypatch):
     _, readings = measured(missing=0.1, repeats=3)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(outliers, "N_DRAWS", 400)
+    monkeypatch.setattr(leverage, "N_DRAWS", 400)
     assert np.abs(drawn_redundancy(system) - exact_leverage(system)[0]).max() < 0.06
 
 
