@@ -170,7 +170,7 @@ def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
     views = tuple(subset(view, np.ones(len(view.m), dtype=bool), (view.k != 7) | (row == 0))
                   for row, view in enumerate(readings.views))
     left = residuals_of(replace(readings, views=views), BARE)
-    assert left.redundancy_theta[0, 7] < 1e-9 and np.isnan(left.squares_theta[0, 7])
+    assert left.lines.redundancy[0, 7] < 1e-9 and np.isnan(left.lines.squares[0, 7])
     assert left.redundancy_theta.sum() == pytest.approx(left.found.theta.dof_residuals)
     # lines beside the gap are checked by fewer readings than the others
     assert np.ptp(left.redundancy_theta[left.redundancy_theta > 0.05]) > 0.1

@@ -22,22 +22,18 @@ removes in part. Before a view is split, its slip therefore competes with every 
 does not hold.
 """
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, fdtrc, gammaincinv
+from scipy.special import chdtri
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.joint.problem import FLOOR, JointFit, Problem, fit
+from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import (
-    Memo,
-    NormalEquations,
-    angular_residuals,
-    grid_residuals,
-)
+from selfcal_ros.estimation.normal.equations import Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (
     SLIP,
@@ -45,17 +41,24 @@ from selfcal_ros.estimation.verdict.causes import (
     cause_of,
     find_explanations,
     noisier_views,
+    scatter_of_views,
 )
 from selfcal_ros.estimation.verdict.leverage import (
-    CHECKED,
     EXACT_SITES,
-    angular_redundancy,
-    drawn_redundancy,
-    exact_leverage,
+    Alone,
+    lines_alone,
+    marks_alone,
     noise_of,
 )
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import Key, Measurements, ViewReadings, left_out, without
+from selfcal_ros.model.readings import (
+    Key,
+    Measurements,
+    ViewReadings,
+    left_out,
+    subset,
+    without,
+)
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Cause, Finding
 
@@ -65,84 +68,26 @@ VIEW_DRAWS = 16
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of all readings.
-
-    Attributes
-    ----------
-    problem : Problem
-        The plan and its readings.
-    found : JointFit
-        Joint fit of the readings.
-    redundancy, redundancy_theta : float array (views, nx, ny), (views, K)
-        1 - h; 0 where not read.
-    skew : complex array (views, nx, ny)
-        Difference of h between the coordinates, see above.
-    """
+    """Residuals of all readings: the problem that they pose, marks and lines by themselves."""
 
     problem: Problem
-    found: JointFit
-    redundancy: np.ndarray
-    redundancy_theta: np.ndarray
-    skew: np.ndarray
+    marks: Alone
+    lines: Alone
 
     @property
-    def squares(self) -> np.ndarray:
-        """Residual' (1 - h)^-1 residual weight, m^2, (views, nx, ny): 2 sigma^2 on average.
-
-        Reduction of the sum of squares without the reading; NaN where it cannot be checked.
-        """
-        residual, skew = self.found.residuals, abs(self.skew)
-        good = self.redundancy - skew > CHECKED
-        both = np.where(good, self.redundancy**2 - skew**2, 1.0)
-        form = (self.redundancy * abs(residual) ** 2
-                + np.real(np.conj(self.skew) * residual**2))
-        return np.where(good, form / both * self.problem.grid.weight, np.nan)
-
-    @property
-    def squares_theta(self) -> np.ndarray:
-        """The same for angular readings, rad^2, (views, K); sigma^2 on average."""
-        return _scaled(self.found.residuals_theta**2, self.problem.angular.weight,
-                       self.redundancy_theta)
-
-    def p_outlier(self, kind: str, at: tuple[int, ...]) -> float:
-        """Return the probability that a good reading fits the others as badly; NaN if unknown.
-
-        F-test of the reading's contribution to the sum of squares against the remainder.
-        """
-        if kind == "grid":
-            system, squares, weight, residual, columns = (
-                self.problem.system, self.squares, self.problem.grid.weight,
-                abs(self.found.residuals), 2)
-            dof = 2 * system.grid.n_readings - system.rank_grid
-        else:
-            system, squares, weight, residual, columns = (
-                self.problem.system, self.squares_theta, self.problem.angular.weight,
-                self.found.residuals_theta, 1)
-            dof = system.angular.n_readings - system.rank_angular
-        rest = float((weight * residual**2).sum()) - float(squares[at])
-        if not np.isfinite(rest) or dof <= columns:
-            return float("nan")
-        noise = max(rest / (dof - columns), FLOOR**2)
-        return float(fdtrc(columns, dof - columns, squares[at] / columns / noise))
-
-
-def _scaled(squares: np.ndarray, weight: np.ndarray, redundancy: np.ndarray) -> np.ndarray:
-    good = redundancy > CHECKED
-    return np.where(good, squares * weight / np.where(good, redundancy, 1.0), np.nan)
+    def level(self) -> float:
+        """Level of the test of one reading, so that all checked ones have OUTLIER_LEVEL."""
+        checked = sum(np.isfinite(kind.squares).sum() for kind in (self.marks, self.lines))
+        return OUTLIER_LEVEL / max(checked, 1)
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
-    """Fit the readings jointly and return their residuals with redundancies."""
+    """Fit marks and lines, each by themselves, and return their residuals."""
     problem, _ = prepare(measurements, options)
-    system = problem.system
-    found = replace(fit(problem, problem.grid.y), residuals=grid_residuals(system, problem.grid.y),
-                    residuals_theta=angular_residuals(system, problem.angular.y))
-    if system.grid.n_sites <= EXACT_SITES and measurements.artifact.map_grid is None:
-        redundancy, skew = exact_leverage(system)
-    else:
-        redundancy = drawn_redundancy(system)
-        skew = np.zeros(redundancy.shape, dtype=complex)
-    return Residuals(problem, found, redundancy, angular_redundancy(system), skew)
+    exact = measurements.artifact.map_grid is None and (
+        problem.system.grid.n_sites <= EXACT_SITES)
+    return Residuals(problem, marks_alone(problem.system, problem.grid.y, exact=exact),
+                     lines_alone(problem.system, problem.angular.y))
 
 
 def view_noise(residuals: Residuals) -> np.ndarray:
@@ -160,7 +105,7 @@ def view_noise(residuals: Residuals) -> np.ndarray:
 
     system, grid = residuals.problem.system, residuals.problem.system.grid
     mixing = _mixings.get(system, None, lambda: _mixing(system))
-    sums = (abs(residuals.found.residuals) ** 2 * grid.weight).sum(axis=(1, 2))
+    sums = (abs(residuals.marks.residual) ** 2 * grid.weight).sum(axis=(1, 2))
     out = np.empty((grid.n_views, 3))
     for v in range(grid.n_views):
         group = np.zeros((grid.n_views, 2))
@@ -199,41 +144,24 @@ MAX_RATIO = 20.0
 
 def noisy_views(residuals: Residuals, measurements: Measurements
                 ) -> tuple[tuple[str, float], ...]:
-    """Return the noisy views, each with the ratio of its noise to that of the others."""
-    found = by_repeats(measurements)
-    for name, ratio in _by_residuals(residuals, measurements).items():
-        found[name] = max(ratio, found.get(name, 0.0))
-    return tuple((view.view.name, found[view.view.name]) for view in measurements.views
-                 if view.view.name in found)
+    """Return the noisy views, each with the ratio of its noise to that of the others.
 
-
-def by_repeats(measurements: Measurements) -> dict[str, float]:
-    """Return the views whose repeats scatter more than those of the others (F-test)."""
-    return {cause.view: cause.size for cause in noisier_views([
-        (v.view.name, v.sigma_xy, v.dof_xy) for v in measurements.views
-        if len(v.m) and v.dof_xy > 0 and np.isfinite(v.sigma_xy)])}
-
-
-def _by_residuals(residuals: Residuals, measurements: Measurements) -> dict[str, float]:
-    if residuals.problem.system.grid.n_views < 2:
-        return {}
-    out = {}
-    for index, (own, others, dof) in zip(residuals.problem.grid.index, view_noise(residuals),
-                                         strict=True):
+    By their own repeats, and by residuals.
+    """
+    found = {cause.view: cause.size for cause in noisier_views(scatter_of_views(measurements))}
+    names = [measurements.views[index].view.name for index in residuals.problem.grid.index]
+    for name, (own, others, dof) in zip(names, view_noise(residuals), strict=True):
         ratio = float(own / max(others, own / MAX_RATIO, FLOOR))
         if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
-            out[measurements.views[index].view.name] = ratio
-    return out
+            found[name] = max(ratio, found.get(name, 0.0))
+    return tuple((name, found[name]) for name in names if name in found)
 
 
 AMBIGUOUS = 16.0
 """Difference of chi^2 up to which two places explain the readings equally well."""
 
 TRIED = 12
-"""Number of places at which the view is split on trial."""
-
-TINY_M2 = 1e-30
-"""Square of a noise that is rounding error."""
+"""Number of places, those that explain most, at which the slip is compared with the others."""
 
 SLIP_LEVEL = 1e-9
 """Level of the test of each place where the plate may have slipped."""
@@ -267,7 +195,7 @@ class SlipPlace:
     index: int
     axis: str
     first: int
-    chi2: float
+    chi2: float = 0.0
 
     @property
     def place(self) -> dict[str, str | int]:
@@ -287,9 +215,9 @@ class Slip(SlipPlace):
         Other places that explain the readings equally well: few views do not always determine it.
     """
 
-    tx_m: float
-    ty_m: float
-    phi_rad: float
+    tx_m: float = 0.0
+    ty_m: float = 0.0
+    phi_rad: float = 0.0
     alternatives: tuple[SlipPlace, ...] = ()
 
     def finding(self, *, spoils: bool) -> Finding:
@@ -300,11 +228,11 @@ class Slip(SlipPlace):
                 "y": self.ty_m, "phi": self.phi_rad, "spoils": spoils})
 
 
-def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
-              options: Options) -> Slip | None:
+def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) -> Slip | None:
     """Return the slip that explains the residuals best; None if no place passes the test.
 
-    The view is split on trial at the places that explain most; the best split is the slip.
+    Of the places that explain most of the clipped residuals, the one where a second misalignment
+    leaves the smallest clipped sum of squares.
 
     Parameters
     ----------
@@ -312,91 +240,82 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements,
         Residuals of the fit.
     sigma_m : float
         Noise of one reading, m.
-    measurements, options : Measurements, Options
-        The readings and how they were fitted.
+    measurements : Measurements
+        The readings, for the names of the views.
     """
-    grid = residuals.problem.system.grid
-    found: list[SlipPlace] = []
-    limit = CLIP * sigma_m / np.sqrt(np.where(grid.read, grid.weight, 1.0))
-    size = abs(residuals.found.residuals)
-    clipped = residuals.found.residuals * np.minimum(1.0, limit / np.maximum(size, 1e-300))
-    for v, i in enumerate(residuals.problem.grid.index):
-        for axis in (0, 1) if measurements.artifact.marks is None else ():
-            for place in _places(grid.read[v], axis):
-                gain = _explained(residuals, clipped, v, axis, place)
-                if gain is not None and gain / sigma_m**2 >= chdtri(3, SLIP_LEVEL):
-                    found.append(SlipPlace(measurements.views[i].view.name, i, "mn"[axis],
-                                           grid.views.mark_at(place, place)[axis],
-                                           gain / sigma_m**2))
-    found.sort(key=lambda slip: -slip.chi2)
-    return _best(found[:TRIED], measurements, options)
-
-
-def _best(found: list[SlipPlace], measurements: Measurements, options: Options) -> Slip | None:
-    """Return the slip whose split leaves the smallest clipped sum of squares."""
-    fits = []
-    for slip in found:
-        try:
-            problem, _ = prepare(split_view(measurements, slip), options)
-        except NotIdentifiableError:
-            continue
-        fitted = fit(problem, problem.grid.y)
-        weight = problem.grid.weight
-        squares = (abs(fitted.residuals) ** 2 * weight)[weight > 0]
-        fits.append((slip, squares, _size(slip, fitted, problem)))
-    if not fits:
+    problem, marks = residuals.problem, residuals.marks
+    limit = CLIP * sigma_m / np.sqrt(np.where(marks.weight > 0, marks.weight, 1.0))
+    clipped = marks.residual * np.minimum(1.0, limit / np.maximum(abs(marks.residual), 1e-300))
+    gains = [(_second_misalignment(problem, place, clipped)[1], place)
+             for place in _places(problem, measurements)]
+    sizes, left, places = [], [], []
+    for gain, place in sorted(gains, key=lambda tried: -tried[0])[:TRIED]:
+        if gain >= sigma_m**2 * chdtri(3, SLIP_LEVEL):
+            size, _ = _second_misalignment(problem, place, marks.residual)
+            after = grid_residuals(problem.system, _slipped(problem, place, size))
+            places.append(replace(place, chi2=gain / sigma_m**2))
+            sizes.append(size)
+            left.append((abs(marks.residual - after) ** 2 * marks.weight)[marks.weight > 0])
+    if not places:
         return None
-    limit = CLIP**2 * max(min(float(np.median(squares)) for _, squares, _ in fits), TINY_M2)
-    losses = [float(np.minimum(squares, limit).sum()) for _, squares, _ in fits]
+    # residuals are smaller than the noise by the part that the fit follows
+    dof_part = (marks.dof - 3) / (2 * len(left[0]))
+    variance = np.maximum(np.median(left, axis=1) / chdtri(2, 0.5) / dof_part, FLOOR**2)
+    losses = np.minimum(left, CLIP**2 * variance.min()).sum(axis=1)
     order = np.argsort(losses, kind="stable")
-    slip, squares, size = fits[order[0]]
-    # the loss counts residuals, which are smaller than the noise by the part that the fit follows
-    system = prepare(split_view(measurements, slip), options)[0].system
-    dof_part = 1 - system.rank_grid / (2 * system.grid.n_readings)
-    near = losses[order[0]] + AMBIGUOUS * float(np.median(squares)) / chdtri(2, 0.5) / dof_part
-    others = tuple(fits[i][0] for i in order[1:] if losses[i] < near)
-    tx_m, ty_m, phi_rad = size
-    return Slip(slip.view, slip.index, slip.axis, slip.first, slip.chi2, tx_m, ty_m, phi_rad,
-                others)
+    best, (phi, x, y) = places[order[0]], sizes[order[0]]
+    moved = complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
+    near = losses < losses.min() + AMBIGUOUS * variance[order[0]]
+    return Slip(**asdict(best), tx_m=moved.real, ty_m=moved.imag,
+                phi_rad=float(phi) / problem.half_width_m,
+                alternatives=tuple(places[at] for at in order[1:] if near[at]))
 
 
-def _size(slip: SlipPlace, fitted: JointFit, problem: Problem) -> tuple[float, float, float]:
-    """Return offset and rotation of the second placement minus those of the first."""
-    row = problem.grid.index.index(slip.index)
-    before, after = fitted.parameters[:3 * problem.system.grid.n_views].reshape(-1, 3)[row:row + 2]
-    phi, re, im = after - before
-    t = problem.grid.poses[row].phase * complex(re, im)
-    return float(t.real), float(t.imag), float(phi / problem.half_width_m)
+def _places(problem: Problem, measurements: Measurements) -> Iterator[SlipPlace]:
+    """Yield the lines of marks before which a slip is tested: three readings on either side."""
+    for row, index in enumerate(problem.grid.index):
+        read = problem.grid.weight[row] > 0
+        for axis in (0, 1) if measurements.artifact.marks is None else ():
+            lines = np.flatnonzero(read.any(axis=1 - axis))[1:] - read.shape[axis] // 2
+            for at in np.linspace(0, len(lines) - 1, min(len(lines), MAX_PLACES)).round():
+                place = SlipPlace(measurements.views[index].view.name, index, "mn"[axis],
+                                  int(lines[int(at)]))
+                if 3 <= after_slip(problem, place).sum() <= read.sum() - 3:
+                    yield place
 
 
-def _places(read: np.ndarray, axis: int) -> np.ndarray:
-    """Return the lines before which a slip is tested: at least one line was read on either side."""
-    lines = np.flatnonzero(read.any(axis=1 - axis))
-    inner = lines[1:]
-    if len(inner) <= MAX_PLACES:
-        return inner
-    return inner[np.linspace(0, len(inner) - 1, MAX_PLACES).round().astype(int)]
+def after_slip(problem: Problem, place: SlipPlace) -> np.ndarray:
+    """Return the marks of the view that were read after a slip, bool (nx, ny)."""
+    read = problem.grid.weight[problem.grid.index.index(place.index)] > 0
+    axis = "mn".index(place.axis)
+    return read & (np.indices(read.shape)[axis] - read.shape[axis] // 2 >= place.first)
 
 
-def _explained(residuals: Residuals, clipped: np.ndarray, v: int, axis: int,
-               place: int) -> float | None:
-    """Return the sum of squares that a slip explains, m^2; None where it cannot be tested."""
-    system = residuals.problem.system
-    grid = system.grid
-    after = grid.read[v].copy()
-    after[(slice(0, place), slice(None))[::1 - 2 * axis]] = False
-    if after.sum() < 3 or (grid.read[v] & ~after).sum() < 3:
-        return None
-    columns = np.zeros((3, *grid.weight.shape), dtype=complex)
-    columns[0, v], columns[1, v], columns[2, v] = (
-        shape * after for shape in (1j * grid.views.z, np.ones_like(grid.views.z),
-                                    np.full_like(grid.views.z, 1j)))
-    projected = np.array([grid_residuals(system, column) for column in columns])
-    normal = np.einsum("avij,bvij,vij->ab", np.conj(projected), projected, grid.weight).real
+def _slipped(problem: Problem, place: SlipPlace, size: np.ndarray) -> np.ndarray:
+    """Return what a slip by phi and offset (3,), as in `JointFit`, makes of the readings, m."""
+    phi, x, y = size
+    out = np.zeros(problem.grid.weight.shape, dtype=complex)
+    z = problem.system.grid.views.z
+    out[problem.grid.index.index(place.index)] = after_slip(problem, place) * (
+        1j * phi * z + complex(x, y))
+    return out
+
+
+def _second_misalignment(problem: Problem, place: SlipPlace,
+                         residual: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the misalignment after a slip less that before, (3,), and the squares it explains.
+
+    By the projection of its three columns on the residuals (views, nx, ny); 0 where the readings
+    do not determine it.
+    """
+    columns = [grid_residuals(problem.system, _slipped(problem, place, unit)) for unit in np.eye(3)]
+    weighted = np.conj(columns) * problem.grid.weight
+    normal = np.tensordot(weighted, columns, axes=([1, 2, 3], [1, 2, 3])).real
     if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
-        return None
-    right = np.einsum("avij,vij,vij->a", np.conj(projected), clipped, grid.weight).real
-    return float(right @ np.linalg.solve(normal, right))
+        return np.zeros(3), 0.0
+    right = np.tensordot(weighted, residual, axes=3).real
+    fitted = np.linalg.solve(normal, right)
+    return fitted, float(right @ fitted)
 
 
 def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
@@ -406,24 +325,22 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
-    parts = [_grid_part(view, ~after, ""), _grid_part(view, after, " after slip")]
+    parts = [_part(view, ~after, ""), _part(view, after, " after slip")]
     if len(view.k):
-        lines = replace(view.view, name=view.view.name + " lines", grid=False)
-        parts.append(replace(ViewReadings(lines), k=view.k, dtheta=view.dtheta,
-                             count_theta=view.count_theta, u_theta=view.u_theta,
-                             sigma_theta=view.sigma_theta, dof_theta=view.dof_theta))
+        parts.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
     views = (*measurements.views[:slip.index], *parts, *measurements.views[slip.index + 1:])
     return replace(measurements, views=views)
 
 
-def _grid_part(view: ViewReadings, keep: np.ndarray, suffix: str) -> ViewReadings:
-    named = replace(view.view, name=view.view.name + suffix, angular=False)
-    used = int(view.count[keep].sum())
-    return ViewReadings(named, view.m[keep], view.n[keep], view.dx[keep], view.dy[keep],
-                        view.count[keep], view.u[keep] if len(view.u) else view.u,
-                        sigma_xy=view.sigma_xy, dof_xy=int(view.dof_xy * keep.mean()), used=used,
-                        rejected={} if suffix else view.rejected,
-                        visits=None if view.visits is None else view.visits.of_marks(keep))
+def _part(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewReadings:
+    """Return some marks of a view, or its lines if there are none, as a placement of their own."""
+    lines = not marks.any()
+    named = replace(view.view, name=view.view.name + suffix, grid=not lines, angular=lines)
+    return replace(
+        subset(view, marks, np.full(len(view.k), lines)), view=named,
+        dof_xy=int(view.dof_xy * marks.mean()), dof_theta=view.dof_theta * lines,
+        used=int(view.count[marks].sum()), rejected={} if suffix else view.rejected,
+        motion=None, motion_theta=None)
 
 
 def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> Cause | None:
@@ -435,14 +352,12 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
         As `selfcal_ros.estimation.api.calibrate`.
     """
     model = fit_joint(measurements, options)
-    problem, axis = model.problem, "mn".index(slip.axis)
-    row, shape = problem.grid.index.index(slip.index), problem.ground.z.shape
-    after = np.indices(shape)[axis] - shape[axis] // 2 >= slip.first
+    row = model.problem.grid.index.index(slip.index)
     found = find_explanations(model, slips=True, readings=False, placed=PlacedSlip(
-        row, after & (problem.ground.weight[row] > 0), 2 * MAX_PLACES))
+        row, after_slip(model.problem, slip), 2 * MAX_PLACES))
     if not found or found[0].name == SLIP:
         return None
-    return cause_of(found[0], problem.ground)
+    return cause_of(found[0], model.problem.ground)
 
 
 OUTLIER_LEVEL = 0.01
@@ -519,7 +434,7 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
     noisy = noisy_views(residuals, screened.measurements)
     findings = [*screened.notes, *_findings(removed, noisy, stopped)]
-    unchecked = int((np.isnan(residuals.squares) & (residuals.problem.grid.weight > 0)).sum())
+    unchecked = int((np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum())
     return OutlierScreening(without(screened.measurements, gone, mark=True), removed,
                             screened.slips, noisy, unchecked, tuple(findings))
 
@@ -540,8 +455,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
     flattened = _flattened(measurements, options)
     at = _Screened(measurements, flattened, residuals_of(flattened, linear))
     for _ in range(MAX_SLIPS + MAX_TERMS + 1):
-        sigma = max(robust_sigma(at.residuals.squares, 2), FLOOR)
-        slip = find_slip(at.residuals, sigma, at.flattened, linear)
+        slip = find_slip(at.residuals, robust_sigma(at.residuals.marks), at.flattened)
         if slip is None:
             return at
         if len(at.slips) == MAX_SLIPS:
@@ -581,13 +495,12 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
                      (*at.notes, slip.finding(spoils=False))), True
 
 
-def robust_sigma(squares: np.ndarray, dof: int) -> float:
-    """Return the noise from the median of standardised squares; NaN if there are none."""
-    known = squares[np.isfinite(squares)]
-    if not len(known):
-        return float("nan")
-    median = 2 * gammaincinv(dof / 2, 0.5)  # of chi^2
-    return float(np.sqrt(np.median(known) / median))
+def robust_sigma(readings: Alone) -> float:
+    """Return the noise from the median of standardised squares, at least FLOOR."""
+    squares = readings.squares[np.isfinite(readings.squares)]
+    if not len(squares):
+        return FLOOR
+    return max(float(np.sqrt(np.median(squares) / chdtri(readings.coordinates, 0.5))), FLOOR)
 
 
 def _reject(measurements: Measurements, options: Options, residuals: Residuals
@@ -614,55 +527,32 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
-    """Return the outliers of one round: the largest, one for each mark and site."""
+    """Return the outliers of one round: the largest, one for each mark and site, and one line."""
+    problem = residuals.problem
+    sites = problem.system.grid.views.site_index
     found: dict[Key, Removed] = {}
-    grid, problem = residuals.problem.system.grid, residuals.problem
-    sigma = robust_sigma(residuals.squares, 2)
-    ratio = _ratio(residuals.squares, sigma)
-    taken: dict[tuple[str, int], float] = {}
-    # by rounded ratios, so that equal ones keep the order of the readings
-    order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
-    floor = max(chdtri(2, _level(residuals)), NEAR_LARGEST * float(ratio.max()))
-    for at in order[:int((ratio > floor).sum())]:
-        v, i, j = np.unravel_index(at, ratio.shape)
-        nodes = (("mark", int(i * ratio.shape[2] + j)),
-                 ("site", int(grid.views.site_index[v, i, j])))
-        above = max((taken[node] for node in nodes if node in taken), default=0.0)
-        if above > (1 + TIED) * ratio[v, i, j]:
-            continue
-        taken |= {node: float(ratio[v, i, j]) for node in nodes if node not in taken}
-        index, mark = problem.grid.index[v], grid.views.mark_at(i, j)
-        found[index, "grid", mark] = Removed(
-            measurements.views[index].view.name, "grid", mark, float(np.sqrt(ratio[v, i, j])),
-            float(1 - residuals.redundancy[v, i, j]),
-            float(abs(residuals.found.residuals[v, i, j])))
-    return found | _worst_theta(residuals, measurements)
-
-
-def _worst_theta(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
-    """Return the largest outlier of the lines in a round, if there is one."""
-    squares = residuals.squares_theta
-    if not np.isfinite(squares).any():
-        return {}
-    ratio = _ratio(squares, robust_sigma(squares, 1))
-    v, k = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    if ratio[v, k] <= chdtri(1, _level(residuals)):
-        return {}
-    index = residuals.problem.angular.index[v]
-    return {(index, "angular", (int(k),)): Removed(
-        measurements.views[index].view.name, "angular", (int(k),), float(np.sqrt(ratio[v, k])),
-        float(1 - residuals.redundancy_theta[v, k]),
-        float(abs(residuals.found.residuals_theta[v, k])))}
-
-
-def _ratio(squares: np.ndarray, sigma: float) -> np.ndarray:
-    return np.nan_to_num(squares, nan=0.0) / max(sigma, FLOOR) ** 2
-
-
-def _level(residuals: Residuals) -> float:
-    """Return the level of the test of one reading, so that all checked ones have OUTLIER_LEVEL."""
-    return OUTLIER_LEVEL / max(np.isfinite(residuals.squares).sum()
-                               + np.isfinite(residuals.squares_theta).sum(), 1)
+    for readings, of_views in ((residuals.marks, problem.grid), (residuals.lines, problem.angular)):
+        ratio = np.nan_to_num(readings.squares, nan=0.0) / robust_sigma(readings) ** 2
+        # by rounded ratios, so that equal ones keep the order of the readings
+        order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
+        floor = max(chdtri(readings.coordinates, residuals.level),
+                    NEAR_LARGEST * float(ratio.max(initial=0.0)))
+        taken: dict[object, float] = {}
+        for number in order[:int((ratio > floor).sum())]:
+            at = tuple(int(i) for i in np.unravel_index(number, ratio.shape))
+            grid = readings.kind == "grid"
+            nodes = (("mark", at[1:]), ("site", int(sites[at]))) if grid else ("lines",)
+            above = max((taken[node] for node in nodes if node in taken), default=0.0)
+            if above > (1 + TIED) * ratio[at]:
+                continue
+            taken |= {node: float(ratio[at]) for node in nodes if node not in taken}
+            index = of_views.index[at[0]]
+            mark = problem.system.grid.views.mark_at(*at[1:]) if grid else at[1:]
+            found[index, readings.kind, mark] = Removed(
+                measurements.views[index].view.name, readings.kind, mark,
+                float(np.sqrt(ratio[at])), float(1 - readings.redundancy[at]),
+                float(abs(readings.residual[at])))
+    return found
 
 
 def _restored(measurements: Measurements, options: Options, gone: dict[Key, Removed],
@@ -688,14 +578,13 @@ def _restored(measurements: Measurements, options: Options, gone: dict[Key, Remo
 def _agrees(residuals: Residuals, key: Key) -> bool:
     """Return whether a reading can be checked against the others, and agrees with them."""
     index, kind, mark = key
-    at: tuple[int, ...]
-    if kind == "grid":
-        views = residuals.problem.system.grid.views
-        at = (residuals.problem.grid.index.index(index), *views.index_of(*mark))
-    else:
-        at = (residuals.problem.angular.index.index(index), *mark)
+    problem = residuals.problem
     # NaN: a reading that cannot be checked does not agree
-    return residuals.p_outlier(kind, at) >= _level(residuals)
+    if kind == "grid":
+        at = (problem.grid.index.index(index), *problem.system.grid.views.index_of(*mark))
+        return residuals.marks.p_outlier(at) >= residuals.level
+    return residuals.lines.p_outlier(
+        (problem.angular.index.index(index), *mark)) >= residuals.level
 
 
 def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],

@@ -34,10 +34,10 @@ from selfcal_ros.estimation.joint.problem import (
     noise_excess,
     pooled,
 )
-from selfcal_ros.estimation.normal.equations import angular_residuals
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
+from selfcal_ros.estimation.verdict.leverage import lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -645,9 +645,6 @@ NOISY = 1.5
 SURE = 3.0
 """Ratio of a rotation to its standard uncertainty above which the readings determine its view."""
 
-CHECKED = 1e-6
-"""Smallest share of a reading's error in its own residual: the part that other readings check."""
-
 
 def cause_of(found: Explanation, ground: TermInputs) -> Cause:
     """Return an explanation of the residuals, or a term of the model, as a cause.
@@ -683,22 +680,23 @@ def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = Tru
     return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 
 
-def scatter_of_views(model: ModelFit, measurements: Measurements
-                     ) -> list[tuple[str, float, float]]:
+def scatter_of_views(measurements: Measurements,
+                     model: ModelFit | None = None) -> list[tuple[str, float, float]]:
     """Return (name, noise of one reading, degrees of freedom) from the repeats of each grid view.
 
     If marks were visited again, from the visits after subtraction of the fitted terms.
     """
-    out, again = [], {row: (visits, rest) for row, visits, rest in model.visits_about_means()
-                      if model.equations is not None and visits.repeated}
-    for row, index in enumerate(model.problem.grid.index):
-        view = measurements.views[index]
+    again = {} if model is None or model.equations is None else {
+        model.problem.grid.index[row]: (visits, rest)
+        for row, visits, rest in model.visits_about_means() if visits.repeated}
+    out = []
+    for index, view in enumerate(measurements.views):
         sigma, dof = view.sigma_xy, float(view.dof_xy)
-        if row in again:
-            visits, rest = again[row]
+        if index in again:
+            visits, rest = again[index]
             dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
             sigma = float(np.sqrt(visits.weight @ abs(rest) ** 2 / dof))
-        if dof > 0 and np.isfinite(sigma):
+        if len(view.m) and dof > 0 and np.isfinite(sigma):
             out.append((view.view.name, sigma, dof))
     return out
 
@@ -793,32 +791,18 @@ def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cau
     level : float
         Level of the test.
     """
-    worst = min(_suspects(model, measurements), key=lambda line: line.p, default=None)
-    return worst if worst is not None and worst.p < level else None
-
-
-def _suspects(model: ModelFit, measurements: Measurements) -> Iterator[Cause]:
-    """Yield the readings of lines with the largest residuals, each tested."""
-    problem, system, angular = model.problem, model.problem.system, model.problem.system.angular
+    problem = model.problem
+    lines = lines_alone(problem.system, problem.angular.y)
+    squares = np.nan_to_num(lines.squares, nan=-1.0)
+    if not (squares > 0).any():
+        return None
+    v, k = (int(i) for i in np.unravel_index(int(squares.argmax()), squares.shape))
+    if not lines.noise_without((v, k)) > FLOOR:
+        return None
     least = least_noise_rad(problem, model.found.xy.sigma)
-    dof = angular.n_readings - system.rank_angular
-    if dof < 2:
-        return
-    residuals = angular_residuals(system, problem.angular.y)
-    squares = angular.weight * residuals**2
-    for at in np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]:
-        v, k = (int(i) for i in np.unravel_index(at, squares.shape))
-        unit = np.zeros(squares.shape)
-        unit[v, k] = 1.0
-        left, weight = float(angular_residuals(system, unit)[v, k]), float(angular.weight[v, k])
-        if weight <= 0 or left < CHECKED:
-            continue
-        off = float(residuals[v, k]) / left
-        gained = weight * left * off**2
-        variance = max(float(squares.sum()) - gained, 0.0) / (dof - 1)
-        if variance <= FLOOR**2:
-            continue
-        variance = max(variance, least**2)
-        p = float(fdtrc(1, dof - 1, gained / variance)) * angular.n_readings
-        yield Cause(READING, off, float(np.sqrt(variance / (weight * left))), "rad", min(p, 1.0),
-                    measurements.views[problem.angular.index[v]].view.name, mark=(k,))
+    p = min(lines.p_outlier((v, k), least) * problem.system.angular.n_readings, 1.0)
+    checked = lines.redundancy[v, k]
+    u = lines.noise_without((v, k), least) / math.sqrt(lines.weight[v, k] * checked)
+    view = measurements.views[problem.angular.index[v]].view.name
+    return Cause(READING, float(lines.residual[v, k] / checked), u, "rad", p, view,
+                 mark=(k,)) if p < level else None

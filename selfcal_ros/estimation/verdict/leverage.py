@@ -8,11 +8,18 @@ coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rota
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtrc
 
+from selfcal_ros.estimation.joint.problem import FLOOR
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.normal.equations import NormalEquations, grid_residuals
+from selfcal_ros.estimation.normal.equations import (
+    NormalEquations,
+    angular_residuals,
+    grid_residuals,
+)
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 EXACT_SITES = 31 * 31
@@ -26,6 +33,83 @@ N_DRAWS = 64
 
 CHECKED = 0.05
 """Smallest 1 - h of a reading that the others can check."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """Readings of one kind, marks or lines, fitted by themselves.
+
+    Attributes
+    ----------
+    kind : str
+        ``grid`` or ``angular``.
+    residual : complex array (views, nx, ny), float array (views, K)
+        Residuals, plate frame, m; or those of lines, rad. 0 where not read.
+    weight, redundancy : float array, of the same shape
+        Weights, and 1 - h; 0 where not read.
+    dof : float
+        Degrees of freedom of the residuals.
+    skew : complex array, of the same shape
+        Difference of h between the coordinates of a mark, see above.
+    """
+
+    kind: str
+    residual: np.ndarray
+    weight: np.ndarray
+    redundancy: np.ndarray
+    dof: float
+    skew: np.ndarray
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates of a reading."""
+        return 2 if self.kind == "grid" else 1
+
+    @property
+    def squares(self) -> np.ndarray:
+        """Residual' (1 - h)^-1 residual weight, m^2 or rad^2: sigma^2 a coordinate on average.
+
+        Reduction of the sum of squares without the reading; NaN where it cannot be checked.
+        """
+        skew = abs(self.skew)
+        good = self.redundancy - skew > CHECKED
+        both = np.where(good, self.redundancy**2 - skew**2, 1.0)
+        form = (self.redundancy * abs(self.residual) ** 2
+                + np.real(np.conj(self.skew) * self.residual**2))
+        return np.where(good, form / both * self.weight, np.nan)
+
+    def noise_without(self, at: tuple[int, ...], least: float = FLOOR) -> float:
+        """Return the noise that the residuals show without one reading, at least `least`.
+
+        NaN where the others do not check the reading, or have no noise to compare it with.
+        """
+        dof = self.dof - self.coordinates
+        rest = float((self.weight * abs(self.residual) ** 2).sum()) - float(self.squares[at])
+        known = dof > 0 and np.isfinite(rest)
+        return max(float(np.sqrt(max(rest, 0.0) / dof)), least) if known else float("nan")
+
+    def p_outlier(self, at: tuple[int, ...], least: float = FLOOR) -> float:
+        """Return the probability that a good reading fits the others as badly; NaN if unknown.
+
+        F-test of the reading's contribution to the sum of squares against the remainder.
+        """
+        n, noise = self.coordinates, self.noise_without(at, least)
+        return float(fdtrc(n, self.dof - n, self.squares[at] / n / noise**2))
+
+
+def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> Alone:
+    """Return the grid readings y, complex (views, nx, ny), m, fitted by themselves."""
+    redundancy, skew = exact_leverage(system) if exact else (drawn_redundancy(system), 0j)
+    return Alone("grid", grid_residuals(system, y), system.grid.weight, redundancy,
+                 2 * system.grid.n_readings - system.rank_grid,
+                 skew + np.zeros_like(redundancy))
+
+
+def lines_alone(system: NormalEquations, y: np.ndarray) -> Alone:
+    """Return the readings of lines y, (views, K), rad, fitted by themselves."""
+    redundancy = angular_redundancy(system)
+    return Alone("angular", angular_residuals(system, y), system.angular.weight, redundancy,
+                 system.angular.n_readings - system.rank_angular, np.zeros_like(redundancy))
 
 
 def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:

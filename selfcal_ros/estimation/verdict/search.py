@@ -385,7 +385,7 @@ def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
 
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
-    views = scatter_of_views(found.solved.joint, measurements)
+    views = scatter_of_views(measurements, found.solved.joint)
     emap, noisy = found.solved.result.error_map, noisier_views(views)
     largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
     if (ratio := largest / found.solved.xy.sigma) > 1:

@@ -10,7 +10,7 @@ from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
-from selfcal_ros.estimation.quality.outliers import by_repeats, clean, residuals_of
+from selfcal_ros.estimation.quality.outliers import clean, noisy_views, residuals_of
 from selfcal_ros.estimation.verdict import leverage
 from selfcal_ros.estimation.verdict.leverage import (
     angular_redundancy,
@@ -83,7 +83,7 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
     _, readings = measured(missing=0.1)
     left = residuals_of(readings, ZERO_MEAN)
     system = left.problem.system
-    assert 2 * left.redundancy.sum() == pytest.approx(
+    assert 2 * left.marks.redundancy.sum() == pytest.approx(
         2 * system.grid.n_readings - system.rank_grid, rel=1e-9)
     assert angular_redundancy(system).sum() == pytest.approx(
         system.angular.n_readings - system.rank_angular, rel=1e-9)
@@ -106,7 +106,7 @@ def test_drawn_and_exact_redundancies_agree(monkeypatch):
 
 def test_standardised_residuals_are_chi_square():
     squares = np.concatenate([
-        residuals_of(measured(seed, repeats=2, linear=True)[1], LINEAR).squares.ravel()
+        residuals_of(measured(seed, repeats=2, linear=True)[1], LINEAR).marks.squares.ravel()
         for seed in range(10)]) / SIGMA_M**2
     squares = squares[np.isfinite(squares)]
     assert squares.mean() == pytest.approx(2, rel=0.08)
@@ -147,21 +147,21 @@ def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
     readings = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True,
                                      sigma_theta_rad=SIGMA_RAD)
     whole = residuals_of(readings, LINEAR)
-    total = (abs(whole.found.residuals) ** 2).sum()
+    total = (abs(whole.marks.residual) ** 2).sum()
     for mark in ((-2, 1), (0, 0), (2, 2)):
         rest = residuals_of(without(readings, [(1, "grid", mark)]), LINEAR)
-        left = (abs(rest.found.residuals) ** 2).sum()
+        left = (abs(rest.marks.residual) ** 2).sum()
         at, dof = (1, mark[0] + 2, mark[1] + 2), dof_of(rest)
-        assert whole.squares[at] == pytest.approx(total - left, rel=1e-6)
-        assert whole.p_outlier("grid", at) == pytest.approx(
+        assert whole.marks.squares[at] == pytest.approx(total - left, rel=1e-6)
+        assert whole.marks.p_outlier(at) == pytest.approx(
             f_distribution.sf((total - left) / 2 / (left / dof), 2, dof), rel=1e-5)
-    total = (whole.found.residuals_theta**2).sum()
+    total = (whole.lines.residual**2).sum()
     rest = residuals_of(without(readings, [(0, "angular", (3,))]), LINEAR)
-    left = (rest.found.residuals_theta**2).sum()
-    assert whole.squares_theta[0, 3] == pytest.approx(total - left, rel=1e-6)
+    left = (rest.lines.residual**2).sum()
+    assert whole.lines.squares[0, 3] == pytest.approx(total - left, rel=1e-6)
     angular = rest.problem.system
     dof = angular.angular.n_readings - angular.rank_angular
-    assert whole.p_outlier("angular", (0, 3)) == pytest.approx(
+    assert whole.lines.p_outlier((0, 3)) == pytest.approx(
         f_distribution.sf((total - left) / (left / dof), 1, dof), rel=1e-5)
 
 
@@ -247,8 +247,7 @@ def test_a_view_is_compared_by_its_own_repeats():
     shaken = replace(readings, views=tuple(
         replace(v, sigma_xy=2 * v.sigma_xy) if i == 1 else v
         for i, v in enumerate(readings.views)))
-    assert by_repeats(readings) == {}
-    assert by_repeats(shaken) == {"rot90": pytest.approx(2.0)}
+    assert noisy_views(residuals_of(readings, ZERO_MEAN), readings) == ()
     (named,) = robust_calibrate(shaken, ZERO_MEAN).extra["noisy_views"]
     assert named["view"] == "rot90" and named["ratio"] == pytest.approx(2.0)
 
@@ -262,8 +261,8 @@ def test_a_reading_goes_where_it_adds_more_than_one_in_a_hundred_sets_of_good_on
         given = with_errors(readings, 1, dx={(2, -3): planted_m})
         found = residuals_of(without(given, {(1, "grid", (2, -3))}) if without_it else given,
                              LINEAR)
-        checked = np.isfinite(found.squares).sum() + np.isfinite(found.squares_theta).sum()
-        return float((abs(found.found.residuals) ** 2).sum()), found.found.xy.dof, checked
+        checked = sum(np.isfinite(kind.squares).sum() for kind in (found.marks, found.lines))
+        return float((abs(found.marks.residual) ** 2).sum()), found.marks.dof, checked
 
     rest, dof, _ = squares(0.0, without_it=True)
     limit = rest * (1 + 2 / dof * f_distribution.isf(0.01 / squares(0.0)[2], 2, dof))

@@ -88,6 +88,6 @@ def test_what_is_left_over_is_that_of_the_dense_fit():
     found = residuals_of(readings, LINEAR)
     left, y, of_view = dense(readings)
     weight = found.problem.grid.weight
-    squares = (abs(found.found.residuals) ** 2 * weight).sum(axis=(1, 2))
+    squares = (abs(found.marks.residual) ** 2 * weight).sum(axis=(1, 2))
     wanted = [((left @ y)[of_view == v] ** 2).sum() for v in range(5)]
     np.testing.assert_allclose(squares, wanted, rtol=1e-9)
