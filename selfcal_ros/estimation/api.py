@@ -104,14 +104,12 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         _check_turned(measurements, options, contradicted=not _fits(result))
     if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
         check_placing(measurements)  # without repeats residuals are the noise: no contradiction
-    shown = {} if camera is None else camera.to_dict()
-    if solved.model is not None and measurements.has_images:
-        yaw = yaw_of(solved.model, measurements.sense)
-        shown |= {} if yaw is None else {"yaw": yaw}
-    result = replace(result, extra={**result.extra, "camera": shown}) if shown else result
-    if measurements.has_images:
-        result = replace(result, findings=(*result.findings, *few_read(measurements, camera)))
-    return result
+    if not measurements.has_images:
+        return result
+    return replace(
+        result, findings=(*result.findings, *few_read(measurements, camera)),
+        camera=None if camera is None else camera.shown,
+        stage_yaw=None if solved.model is None else yaw_of(solved.model, measurements.sense))
 
 
 def calibrate_corrected(measurements: Measurements, options: Options) -> CalibrationResult:

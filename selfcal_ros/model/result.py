@@ -16,6 +16,12 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.camera import (
+    CameraErrors,
+    StageYawMap,
+    camera_to_dict,
+    shown_by_images,
+)
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.plate_form import (
     artifact_of,
@@ -177,7 +183,8 @@ class Noise:
 class CalibrationResult:
     """The result of a calibration.
 
-    `recheck` is what views of a known plate show to have changed; None of a calibration.
+    `recheck` is what views of a known plate show to have changed; None of a calibration. `camera`
+    and `stage_yaw` are what images of several marks show, None without.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the
     name of the file and its SHA-256, of a result that was read from one.
@@ -204,6 +211,8 @@ class CalibrationResult:
     budget: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
     recheck: Recheck | None = None
+    camera: CameraErrors | None = None
+    stage_yaw: StageYawMap | None = None
     read_from: tuple[str, str] | None = None
 
     @property
@@ -314,6 +323,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "budget": plain([line_to_dict(line) for line in result.budget]),
         "input": dict(result.input),
         **({} if result.recheck is None else {"recheck": result.recheck.to_dict()}),
+        **({"camera": shown} if (shown := camera_to_dict(result.camera, result.stage_yaw)) else {}),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -371,7 +381,7 @@ _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "excluded", "input", "map", "recheck", DIGEST}
+          "budget", "excluded", "input", "map", "recheck", "camera", DIGEST}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -427,7 +437,7 @@ def _parse(data: dict) -> CalibrationResult:
         findings_from_list(Finding, data.get("findings", [])),
         budget_from_list(data.get("budget", [])),
         artifact if artifact.map_grid else None,
-        read(Recheck | None, data.get("recheck")))
+        read(Recheck | None, data.get("recheck")), *shown_by_images(data.get("camera")))
 
 
 def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:

@@ -54,7 +54,7 @@ MAX_ROWS = 200
 TITLES = {"outliers": "Marks removed or given less weight", "validation": "Held-out validation",
           "reference": "Reference length"}
 """Known extras, in the order in which they are reported; others follow by name."""
-DRAWN = {"residuals", "rejected_at", "camera"}
+DRAWN = {"residuals", "rejected_at"}
 """Extras that are drawn, not tabulated."""
 _UNITS = (("_m", "µm", UM_PER_M), ("_rad", "arcsec", ARCSEC_PER_RAD), ("_um", "µm", 1.0),
           ("_arcsec", "arcsec", 1.0), ("_mm", "mm", 1.0), ("_s", "s", 1.0))

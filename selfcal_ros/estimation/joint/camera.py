@@ -8,14 +8,13 @@ straightens offsets between them; its degree is the smallest that the cells do n
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.terms.equations import score
+from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
 from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
@@ -105,26 +104,24 @@ class Camera(Distortion):
     noise_image: float
     noise_mark: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form, ``camera`` in RESULT.json."""
+    @property
+    def shown(self) -> CameraErrors:
+        """What a result keeps of it."""
         scale, shear = self.coefficients[1:3]
         u_scale, u_turn = self.u_coefficients[1]
-        known = {cell: {"x": z.real, "y": z.imag, "dx": e.real, "dy": e.imag, "u_dx": u[0],
-                        "u_dy": u[1]} for cell, z, e, u in zip(
+        known = {cell: CameraCell(z.real, z.imag, e.real, e.imag, *u) for cell, z, e, u in zip(
             self.cells, self.place, self.error, self.u, strict=True)}
-        return {
-            "scale": scale.real, "rotation": scale.imag, "stretch": shear.real,
-            "shear": shear.imag, "u_scale": u_scale, "u_rotation": u_turn,
-            "u_stretch": self.u_coefficients[2, 0], "u_shear": self.u_coefficients[2, 1],
-            "degree": max(a + b for a, b in self.powers),
-            "coefficients": [
-                {"power": list(power), "x": value.real, "y": value.imag, "u_x": u[0], "u_y": u[1]}
-                for power, value, u in zip(self.powers, self.coefficients[1:],
-                                           self.u_coefficients[1:], strict=True)],
-            "cells": [known.get(cell, {
-                "x": cell[0] * self.image.pitch_m, "y": cell[1] * self.image.pitch_m,
-                "dx": None, "dy": None, "u_dx": None, "u_dy": None}) for cell in self.image.cells],
-            "noise_image": self.noise_image, "noise_mark": self.noise_mark}
+        return CameraErrors(
+            scale=scale.real, rotation=scale.imag, stretch=shear.real, shear=shear.imag,
+            u_scale=u_scale, u_rotation=u_turn, u_stretch=self.u_coefficients[2, 0],
+            u_shear=self.u_coefficients[2, 1], degree=max(a + b for a, b in self.powers),
+            coefficients=tuple(CameraPower(tuple(power), value.real, value.imag, *u)
+                               for power, value, u in zip(self.powers, self.coefficients[1:],
+                                                          self.u_coefficients[1:], strict=True)),
+            cells=tuple(known.get(cell) or CameraCell(
+                *(part * self.image.pitch_m for part in cell), *[math.nan] * 4)
+                for cell in self.image.cells),
+            noise_image=self.noise_image, noise_mark=self.noise_mark)
 
 
 def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
@@ -277,16 +274,10 @@ def straightened(measurements: Measurements, camera: Distortion) -> Measurements
 
 def known_camera(result: CalibrationResult) -> Distortion | None:
     """Return the camera that a calibration found; None if it found none."""
-    found: Any = result.extra.get("camera", {})
-    if "coefficients" not in found:
+    if result.camera is None:
         return None
-    try:
-        powers = [(int(a), int(b)) for a, b in (one["power"] for one in found["coefficients"])]
-        values = np.array([0, *(complex(one["x"], one["y"]) for one in found["coefficients"])])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError("camera", "no polynomial of a camera",
-                         "write the result again with `selfcal solve`") from error
-    return Distortion(powers, values)
+    return Distortion([(a, b) for a, b in (one.power for one in result.camera.coefficients)],
+                      np.array([0, *(complex(one.x, one.y) for one in result.camera.coefficients)]))
 
 
 def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
@@ -350,13 +341,10 @@ def _read_and_shown(measurements: Measurements
             for name, cell, (m, n), one in parts}
 
 
-def yaw_of(model: ModelFit, sense: Sense) -> dict[str, Any] | None:
+def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     """Return the stage's yaw that a fit shows, whatever size it was given (method eq. 4.17).
 
-    None without images, or if they do not determine it up to its mean. Otherwise ``yaw`` of
-    ``camera`` in RESULT.json: positions of the stage, x and y, m; rotation of what it carries,
-    counter-clockwise, relative to its mean over the nodes, and its standard uncertainty, rad; p,
-    the probability that a stage that does not turn shows as much.
+    None without images, or if they do not determine it up to its mean.
     """
     images, nodes = model.problem.images, model.problem.ground.yaw
     if images is None or images.yaw is None or nodes is None or model.equations is None:
@@ -388,6 +376,5 @@ def yaw_of(model: ModelFit, sense: Sense) -> dict[str, Any] | None:
     statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw
     sign = -1 if sense is Sense.PLATE_MOVES else 1  # (1.6) and its rotations
     place = sign * nodes.nodes[seen]
-    return {"x": place.real.tolist(), "y": place.imag.tolist(), "yaw": (sign * yaw).tolist(),
-            "u_yaw": np.sqrt(np.diag(covariance)).tolist(),
-            "p": float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n))}
+    return StageYawMap(place.real, place.imag, sign * yaw, np.sqrt(np.diag(covariance)),
+                       float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))

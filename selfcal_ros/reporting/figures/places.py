@@ -18,7 +18,7 @@ from selfcal_ros.reporting.figures import drawing as draw
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing, Frame, Point
 from selfcal_ros.reporting.figures.residuals import places_mm
-from selfcal_ros.reporting.summary.numbers import cells_of, significant, yaw_of
+from selfcal_ros.reporting.summary.numbers import significant
 from selfcal_ros.reporting.summary.sections import pose_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M, URAD_PER_RAD
 
@@ -196,9 +196,9 @@ LEFT, TOP, SIDE = 58.0, 40.0, 260.0
 
 def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     """Return the camera's errors, published minus true offset, as vectors; None without images."""
-    cells = cells_of(result)
-    if not cells.size:
+    if result.camera is None:
         return None
+    cells = result.camera.known_cells
     place, error, u = cells[:2] * MM_PER_M, cells[2:4], cells[4:6] * result.noise.k_xy
     apart = abs(place[0] + 1j * place[1] - (place[0] + 1j * place[1])[:, None])
     spacing = float(apart[apart > 0].min(initial=np.inf)) if len(apart) > 1 else 1.0
@@ -222,10 +222,11 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
 
 def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
     """Return the yaw of the stage at its nodes in colour; None without images."""
-    nodes = yaw_of(result)
-    if not nodes.size:
+    found = result.stage_yaw
+    if found is None:
         return None
-    place, (yaw, u) = nodes[:2] * MM_PER_M, nodes[2:] * URAD_PER_RAD
+    place = np.stack([found.x, found.y]) * MM_PER_M
+    yaw, u = found.yaw * URAD_PER_RAD, found.u_yaw * URAD_PER_RAD
     half = [np.diff(np.unique(along)).min(initial=np.inf) / 2 for along in place]
     dx, dy = (side if np.isfinite(side) else min(half) for side in half)
     x, y = (float(np.abs(along).max()) + side for along, side in zip(place, (dx, dy), strict=True))

@@ -14,8 +14,9 @@ from selfcal_ros.model.pose import Image
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.view import View
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.places import camera_errors
-from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of
+from selfcal_ros.reporting.summary.numbers import camera_facts
 from selfcal_ros.reporting.summary.sections import state_sentence
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import few_read_text
@@ -53,7 +54,7 @@ def population(dirty, runs):
     for seed in range(runs):
         truth, measurements = measured(MARK, seed, size=7, **DISTORTED)
         found = calibrate(with_dirt(measurements, dirty), Options(causes=False, terms=STILL))
-        emap, cells = found.error_map, cells_of(found)
+        emap, cells = found.error_map, found.camera.known_cells
         maps.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
         cameras.append((cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2]))
                        / cells[4:])
@@ -71,11 +72,11 @@ def test_map_and_camera_are_found_without_some_cells(dirty, cells):
     assert (np.abs(away[np.isfinite(away)]) < 4.5).all()
     assert 0.75 < np.sqrt(np.nanmean(away**2)) < 1.3
     for found in results:
-        shown = found.extra["camera"]
-        assert cells_of(found).shape == (6, cells) and len(shown["cells"]) == 9
-        assert shown["degree"] == 3
-        assert shown["scale"] == pytest.approx(-0.005, abs=2e-4)
-        assert shown["rotation"] == pytest.approx(0.003, abs=2e-4)
+        shown = found.camera
+        assert found.camera.known_cells.shape == (6, cells) and len(shown.cells) == 9
+        assert shown.degree == 3
+        assert shown.scale == pytest.approx(-0.005, abs=2e-4)
+        assert shown.rotation == pytest.approx(0.003, abs=2e-4)
 
 
 def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
@@ -83,7 +84,7 @@ def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
     found = worded(calibrate(with_dirt(measurements, everywhere(CORNER))))
     found = result_from_dict(result_to_dict(found), "test")
     assert found.verdict.qualified
-    assert found.extra["camera"]["cells"][-1] == {
+    assert plain(found.camera.cells[-1]) == {
         "x": pytest.approx(1e-3), "y": pytest.approx(1e-3), "dx": None, "dy": None, "u_dx": None,
         "u_dy": None}
     assert found.warnings == (
@@ -107,9 +108,9 @@ def test_a_cell_that_one_view_lacks_is_named_with_the_view():
 def test_two_rows_of_cells_show_the_linear_part():
     """Of six cells in two rows a polynomial of the second degree is not determined."""
     _, measurements = measured(MARK, 3, size=7, **DISTORTED)
-    shown = calibrate(with_dirt(measurements, everywhere((-1, 0), (0, 0), (1, 0)))).extra["camera"]
-    assert shown["scale"] == pytest.approx(-0.005, abs=0.02)
-    assert [2, 0] not in [part["power"] for part in shown["coefficients"]]
+    shown = calibrate(with_dirt(measurements, everywhere((-1, 0), (0, 0), (1, 0)))).camera
+    assert shown.scale == pytest.approx(-0.005, abs=0.02)
+    assert (2, 0) not in [part.power for part in shown.coefficients]
 
 
 def test_one_row_of_cells_shows_no_camera():

@@ -93,8 +93,8 @@ def whole(missing: float = 0.0):
 def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     measurements, matrix, stops, inverse = whole(missing)
     result = calibrate(measurements, ALONE)
-    camera = result.extra["camera"]
-    mark, image = camera["noise_mark"], camera["noise_image"]
+    camera = result.camera
+    mark, image = camera.noise_mark, camera.noise_image
     assert image > 2 * mark > 0
     sites = np.prod(measurements.artifact.shape)
     gain = datum(measurements.artifact) @ inverse[:2 * sites]
@@ -124,8 +124,8 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
     _, measurements = measured(3 * MARK, 5, missing=0.06, size=5, sense=sense)
     matrix, stops = dense(measurements)
     result = calibrate(measurements, ALONE)
-    camera = result.extra["camera"]
-    covariance = camera["noise_mark"]**2 * np.eye(len(matrix)) + camera["noise_image"]**2 * np.kron(
+    camera = result.camera
+    covariance = camera.noise_mark**2 * np.eye(len(matrix)) + camera.noise_image**2 * np.kron(
         stops[:, None] == stops, np.eye(2))
     gain = (datum(measurements.artifact) @ np.linalg.pinv(matrix, rcond=1e-10)[:50]).reshape(
         5, 5, 2, -1)
@@ -183,7 +183,7 @@ def within(away: np.ndarray, independent: int, *, least: float = 1.0) -> None:
 
 def away_of(truth, camera) -> np.ndarray:
     """Return (error of the camera - truth) / u at every cell, (2, cells)."""
-    place, error, u = (np.array([[cell[f"{name}{axis}"] for cell in camera["cells"]]
+    place, error, u = (np.array([[getattr(cell, f"{name}{axis}") for cell in camera.cells]
                                  for axis in "xy"]) for name in ("", "d", "u_d"))
     return (error - (physics.seen_offset(truth, place) - place)) / u
 
@@ -200,18 +200,18 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
     assert all(found.verdict.qualified for _, found in results)
     within(away, 20)
-    cameras = [found.extra["camera"] for _, found in results]
-    within(np.array([away_of(truth, found.extra["camera"]) for truth, found in results]), 9)
-    assert all(camera["degree"] == 3 for camera in cameras)
-    mark, image = (np.mean([camera[name] ** 2 for camera in cameras])
+    cameras = [found.camera for _, found in results]
+    within(np.array([away_of(truth, found.camera) for truth, found in results]), 9)
+    assert all(camera.degree == 3 for camera in cameras)
+    mark, image = (np.mean([getattr(camera, name) ** 2 for camera in cameras])
                    for name in ("noise_mark", "noise_image"))
     dof = sum(found.extra[IMAGES]["dof_mark"] for _, found in results)
     assert mark == pytest.approx(MARK**2, rel=3 * np.sqrt(2 / dof))
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
     for camera in cameras:  # published offsets are (1 + E)^-1 times the true ones, then distorted
-        assert camera["scale"] == pytest.approx(-0.005, abs=1e-4)
-        assert camera["rotation"] == pytest.approx(0.003, abs=1e-4)
-        radial = next(c["x"] for c in camera["coefficients"] if c["power"] == [2, 1])
+        assert camera.scale == pytest.approx(-0.005, abs=1e-4)
+        assert camera.rotation == pytest.approx(0.003, abs=1e-4)
+        radial = next(c.x for c in camera.coefficients if c.power == (2, 1))
         assert radial == pytest.approx(0.02 / 1.414e-3**2, rel=0.03)
 
 
@@ -272,10 +272,10 @@ def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
 
 def test_a_camera_without_distortion_has_a_linear_error():
     _, results = population(MARK, 5, 8, repeats=2)
-    cameras = [found.extra["camera"] for _, found in results]
-    assert sum(camera["degree"] == 1 for camera in cameras) >= 7
+    cameras = [found.camera for _, found in results]
+    assert sum(camera.degree == 1 for camera in cameras) >= 7
     assert not any(found.verdict.causes for _, found in results)
-    scale = [camera["scale"] / camera["u_scale"] for camera in cameras]
+    scale = [camera.scale / camera.u_scale for camera in cameras]
     assert np.sqrt(np.mean(np.square(scale))) < 1.8
 
 
@@ -286,7 +286,7 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
     plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
     truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=0.003))
     found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=MARK))
-    assert set(found.extra["camera"]) == {"yaw"}
+    assert found.camera is None and found.stage_yaw is not None
     assert found.observability.identifiable
 
 

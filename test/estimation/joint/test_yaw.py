@@ -73,10 +73,9 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
         stops[:, None] == stops, np.eye(2))
     sites = np.prod(measurements.artifact.shape)
     to_yaw = (np.eye(sites) - 1 / sites) @ inverse[-sites:] / PITCH
-    yaw = {key: np.array(value) for key, value in yaw_of(
-        solved.model, measurements.sense).items()}
-    np.testing.assert_allclose(yaw["yaw"], to_yaw @ y, atol=TURNED * yaw["yaw"].std())
-    np.testing.assert_allclose(yaw["u_yaw"], np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
+    yaw = yaw_of(solved.model, measurements.sense)
+    np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=TURNED * yaw.yaw.std())
+    np.testing.assert_allclose(yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
                                rtol=TURNED)
     to_map = datum(measurements.artifact) @ inverse[:2 * sites]
     emap = solved.result.error_map
@@ -137,16 +136,15 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
             :, :2 * sites] @ project
         estimate = np.linalg.solve(np.eye(len(inverse)) + inverse @ moved, inverse)
         field = project @ estimate[:2 * sites] @ y
-    emap, yaw = solved.result.error_map, {key: np.array(value) for key, value in yaw_of(
-        solved.model, measurements.sense).items()}
+    emap, yaw = solved.result.error_map, yaw_of(solved.model, measurements.sense)
     np.testing.assert_allclose(np.stack([emap.gx, emap.gy], axis=-1).ravel(), field,
                                atol=1e-3 * emap.u_gx.mean())
     noises = solved.model.problem.images.noises(solved.model.found.residuals)
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
         stops[:, None] == stops, np.eye(2))
     to_yaw = (np.eye(sites) - 1 / sites) @ estimate[-sites:] / PITCH
-    np.testing.assert_allclose(yaw["yaw"], to_yaw @ y, atol=1e-3 * yaw["u_yaw"].mean())
-    np.testing.assert_allclose(yaw["u_yaw"], np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
+    np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=1e-3 * yaw.u_yaw.mean())
+    np.testing.assert_allclose(yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
                                rtol=near)
 
 
@@ -162,11 +160,10 @@ def test_only_a_constant_yaw_is_the_cameras():
     assert np.ptp(free, axis=0).max() < 1e-9
 
 
-def turns(truth, camera) -> np.ndarray:
+def turns(truth, found) -> np.ndarray:
     """Return (yaw - truth) / u at the nodes."""
-    yaw = {name: np.array(camera["yaw"][name]) for name in ("x", "y", "yaw", "u_yaw")}
-    true = between_sites(truth.artifact, truth.yaw, np.stack([yaw["x"], yaw["y"]]))
-    return (yaw["yaw"] - (true - true.mean())) / yaw["u_yaw"]
+    true = between_sites(truth.artifact, truth.yaw, np.stack([found.x, found.y]))
+    return (found.yaw - (true - true.mean())) / found.u_yaw
 
 
 @pytest.mark.parametrize(("size", "sense", "rad", "runs"), [
@@ -176,12 +173,12 @@ def test_yaw_and_map_of_a_stage_that_turns_are_within_their_uncertainties(size, 
     away, results = population(MARK, size, runs, sense=sense, stage_yaw_rad=rad)
     assert all(found.verdict.qualified and not found.verdict.causes for _, found in results)
     within(away, 20)
-    within(np.array([turns(truth, found.extra["camera"]) for truth, found in results]), 20)
+    within(np.array([turns(truth, found.stage_yaw) for truth, found in results]), 20)
 
 
 def test_a_stage_that_does_not_turn_shows_none():
     _, results = population(MARK, 5, 6, options=Options(causes=False))
-    p = [found.extra["camera"]["yaw"]["p"] for _, found in results]
+    p = [found.stage_yaw.p for _, found in results]
     assert sum(each < 0.05 for each in p) <= 2
     assert min(p) > 1e-3
 
@@ -228,7 +225,7 @@ def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly(bend_m
             assert of[name, "90"] - of[name, "0"] == pytest.approx(-bend_m / 2, abs=MARK)
         emap = found.error_map
         away.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
-        turned.append(turns(truth, found.extra["camera"]))
+        turned.append(turns(truth, found.stage_yaw))
     within(np.array(away), 20, least=0.85)  # u has the largest size that the readings allow
     within(np.array(turned), 20)
 
@@ -257,7 +254,7 @@ def test_one_line_of_marks_shows_it_too():
         phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0))
     found = calibrate(simulate_measurements(truth, plan, rng, settings=CellSettings(
         sigma_xy_m=MARK, servo_sigma_m=0.0)))
-    assert set(found.extra["camera"]) == {"yaw"}
-    away = turns(truth, found.extra["camera"])
+    assert found.camera is None
+    away = turns(truth, found.stage_yaw)
     assert 0.6 < np.sqrt((away**2).mean()) < 1.5
-    assert found.extra["camera"]["yaw"]["p"] < 1e-3
+    assert found.stage_yaw.p < 1e-3

@@ -7,11 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw, views_in
-from selfcal_ros.reporting.summary.numbers import camera_facts, cells_of, significant, yaw_facts
+from selfcal_ros.reporting.summary.numbers import camera_facts, significant, yaw_facts
 from selfcal_ros.reporting.summary.sections import state_sentence, summary_text, terms_section
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -36,11 +37,11 @@ def test_the_summary_states_the_camera():
     facts = dict(camera_facts(result()))
     assert facts["scale"].startswith("-0.39")
     assert facts["distortion"] == "radial (cubic)"
-    worst = max(result().extra["camera"]["cells"], key=lambda c: np.hypot(c["dx"], c["dy"]))
+    worst = max(result().camera.cells, key=lambda c: np.hypot(c.dx, c.dy))
     assert facts["largest error"].startswith(
-        f"{significant(1e6 * np.hypot(worst['dx'], worst['dy']))} ± ")
+        f"{significant(1e6 * np.hypot(worst.dx, worst.dy))} ± ")
     assert facts["largest error"].endswith(
-        f" at x {worst['x'] * 1e3:.4g} mm, y {worst['y'] * 1e3:.4g} mm of the image")
+        f" at x {worst.x * 1e3:.4g} mm, y {worst.y * 1e3:.4g} mm of the image")
     assert "Camera" in summary_text(result())
     words = {line.split("  ")[1]: line for line in summary_text(result()).splitlines()
              if line.startswith("  ")}
@@ -56,13 +57,13 @@ def test_cells_of_images_are_no_views():
 
 
 def test_the_summary_states_the_yaw_of_the_stage():
-    yaw = result().extra["camera"]["yaw"]
+    yaw = result().stage_yaw
     (fact,) = yaw_facts(result())
     assert fact in camera_facts(result())
     assert fact[1].startswith(
-        f"{significant(min(yaw['yaw']) * 1e6)} to {significant(max(yaw['yaw']) * 1e6)} ± ")
+        f"{significant(min(yaw.yaw) * 1e6)} to {significant(max(yaw.yaw) * 1e6)} ± ")
     assert "not more than its noise" in fact[1]
-    turning = replace(result(), extra={"camera": {"yaw": yaw | {"p": 1e-5}}})
+    turning = replace(result(), camera=None, stage_yaw=replace(yaw, p=1e-5))
     assert yaw_facts(turning)[0][1].endswith("mean; p = 1e-05")
     assert camera_facts(turning) == yaw_facts(turning)
     assert [row for row in terms_section(result()).table if "yaw" in row[0]] == []
@@ -74,16 +75,16 @@ def test_the_report_draws_its_errors():
     drawing = camera_errors(result())
     spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
     assert len(spots) == 9
-    dx = result().extra["camera"]["cells"][0]["dx"]
+    dx = result().camera.cells[0].dx
     assert f"{dx * 1e6:.1f} ±" in spots[0].title
 
 
 def test_the_report_draws_the_yaw():
-    drawing, yaw = stage_yaw(result()), result().extra["camera"]["yaw"]
+    drawing, yaw = stage_yaw(result()), result().stage_yaw
     spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
     assert len(spots) == 25
-    assert spots[7].title.startswith(f"x {yaw['x'][7] * 1e3:.4g} mm, y {yaw['y'][7] * 1e3:.4g} mm")
-    assert f": {significant(yaw['yaw'][7] * 1e6)} ±" in spots[7].title
+    assert spots[7].title.startswith(f"x {yaw.x[7] * 1e3:.4g} mm, y {yaw.y[7] * 1e3:.4g} mm")
+    assert f": {significant(yaw.yaw[7] * 1e6)} ±" in spots[7].title
     fields = [item for item in drawing.items if getattr(item, "fill", "").startswith("d")
               and len(item.lines[0]) == 4]  # those of the scale are closed
     assert len({item.fill for item in fields}) > 5
@@ -97,24 +98,21 @@ def test_the_report_draws_the_yaw():
     assert low.min(axis=0) == pytest.approx([left, top])
 
 
-@pytest.mark.parametrize("yaw", [None, [], {"x": [1.0]}, {
-    "x": [1.0], "y": [1.0], "yaw": [float("nan")], "u_yaw": [1.0], "p": 0.5}])
-def test_without_a_yaw_none_is_shown(yaw):
-    other = replace(result(), extra={"camera": {"yaw": yaw}})
-    assert yaw_facts(other) == ()
-    assert stage_yaw(other) is None
-
-
-@pytest.mark.parametrize("camera", [None, {}, {"cells": []}, {"cells": [{"x": 1}]}, [1], {
-    "cells": [dict.fromkeys(("x", "y", "dx", "dy", "u_dx", "u_dy"), "far")]}, "infinite"])
-def test_without_a_camera_nothing_is_shown(camera):
-    if camera == "infinite":  # but not everywhere
-        known = result().extra["camera"]
-        first, *others = known["cells"]
-        camera = {**known, "cells": [{**first, "dx": np.inf}, *others], "yaw": None}
-    extra = {**result().extra, "camera": camera}
-    other = replace(result(), extra=extra)
-    assert cells_of(other).shape == (6, 0)
-    assert camera_facts(other) == ()
-    assert camera_errors(other) is None
+def test_without_images_nothing_is_shown():
+    other = replace(result(), camera=None, stage_yaw=None)
+    assert camera_facts(other) == yaw_facts(other) == ()
+    assert camera_errors(other) is None and stage_yaw(other) is None
     assert "Camera" not in summary_text(other)
+
+
+def test_a_cell_without_an_error_is_not_drawn():
+    first, *others = result().camera.cells
+    blind = replace(result().camera, cells=(replace(first, dx=np.nan), *others))
+    assert blind.known_cells.shape == (6, 8)
+
+
+@pytest.mark.parametrize("camera", [[1], {"cells": []}, {"yaw": {"x": [1.0]}}, {"yaw": []}])
+def test_a_damaged_camera_is_refused(camera):
+    data = result_to_dict(result()) | {"camera": camera}
+    with pytest.raises(InputError, match="damaged result"):
+        result_from_dict(data, "test")
