@@ -31,8 +31,8 @@ from selfcal_ros.estimation.observability.suggest import (
     best_plan,
     rank_next,
 )
+from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.estimation.terms.planned import Assumed
-from selfcal_ros.estimation.verdict.causes import CAUSE_LEVEL
 from selfcal_ros.files import write_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict

@@ -12,6 +12,9 @@ import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
 
+COVERAGE = 0.9545
+"""Coverage of an expanded uncertainty: k = 2 for many degrees of freedom."""
+
 MANY_DOF = 1e9
 """Finite substitute for infinite degrees of freedom in the tails of F and t."""
 

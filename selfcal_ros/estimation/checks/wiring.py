@@ -36,7 +36,7 @@ SHOWN = 0.01
 DOUBLED, HALVED = 1.5, 0.7
 """Scales beyond which an offset is in wrong units; nearer to 1 the scale is fitted."""
 BEYOND = 3.0
-"""Standard uncertainties of the microscope's scale beyond which repeats contradict it."""
+"""Standard uncertainties beyond which a value is not chance: 0.3 % of good ones are."""
 SCALE_LEVEL = 1e-3
 """Probability, over both axes and both limits, of contradicting a correct scale."""
 LEAST_SLOPE = 0.3

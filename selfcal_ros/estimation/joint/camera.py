@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
+from selfcal_ros.estimation.joint.problem import F_LEVEL
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
@@ -22,8 +23,6 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 
-DEGREE_LEVEL = 1e-3
-"""Level of the test that a polynomial of a higher degree fits the cells better."""
 POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
 cubic ones look like linear ones in three cells."""
@@ -229,7 +228,7 @@ def _polynomial(place: np.ndarray, error: np.ndarray,
         both = np.concatenate([drawn.real, drawn.imag], axis=1)
         value, (k, n) = np.concatenate([added.real, added.imag]), both.shape
         squares = value @ np.linalg.solve(both.T @ both / k, value)
-        if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < DEGREE_LEVEL:
+        if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < F_LEVEL:
             powers, fit = more, wider
     return powers, fit
 

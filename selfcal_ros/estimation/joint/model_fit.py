@@ -39,6 +39,7 @@ from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
+    NO_VARIANCE,
     ReducedColumns,
     SizeTest,
     TermEquations,
@@ -79,9 +80,6 @@ FEW_DOF = 10
 
 OFFSET_STEPS = 10
 """Largest number of steps in which noise is removed from the microscope's offsets again."""
-
-FIXED = 1e-12
-"""Variance of a misalignment, against the largest, that is rounding: a datum fixes it."""
 
 SHRINKS = 0.5
 """Ratio of two steps above which they no longer shrink."""
@@ -294,7 +292,7 @@ class _State:
             return False
         of_view = sigma / np.sqrt(weight.reshape(len(weight), -1).sum(axis=1).max())
         spread = np.diag(self.found.inverse)
-        told = spread > FIXED * spread.max(initial=0.0)
+        told = spread > NO_VARIANCE * spread.max(initial=0.0)
         noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
         still = bool((self.moved_m <= part * noise).all()) or self.changed_m <= part * of_view
         return still and self.moving.change <= part * of_view

@@ -20,7 +20,7 @@ from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, between_visits, squares_within
-from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm
 
@@ -35,13 +35,10 @@ MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
 
 F_LEVEL = 1e-3
-"""Two-sided level of the test that repeats and residuals have the same noise."""
+"""Level of a test of all readings together: one good session in a thousand fails it."""
 
 SAME = 1.1
 """Ratio of two noises up to which they count as equal, however significant the difference."""
-
-COVERAGE = 0.9545
-"""Coverage of an expanded uncertainty: k = 2 for many degrees of freedom."""
 
 
 @dataclass(frozen=True)

@@ -192,7 +192,7 @@ KEY = "covariance_terms"
 """Key of the factors in a result."""
 
 MAX_FULL = 31 * 31
-"""Largest field for a full covariance matrix."""
+"""Largest field with a full matrix over its sites: covariance, leverages of the readings."""
 
 BESIDE = "beside"
 """Key of what each factor makes of other quantities: `plate` (r, 2, nx, ny), as those of the map;
@@ -333,7 +333,7 @@ def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
 
 
 UNASKED_SITES = 201 * 201
-"""Largest field of which the uncertainty is given unasked: a second, beyond it takes many."""
+"""Largest field with an uncertainty and a search for causes unasked: a second, beyond many."""
 
 
 def solve_joint(measurements: Measurements, options: Options, *,

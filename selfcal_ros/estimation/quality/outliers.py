@@ -31,7 +31,7 @@ from scipy.special import chdtri
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
-from selfcal_ros.estimation.joint.solve import fit_joint, prepare
+from selfcal_ros.estimation.joint.solve import MAX_FULL, fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
@@ -44,7 +44,7 @@ from selfcal_ros.estimation.verdict.causes import (
     scatter_of_views,
 )
 from selfcal_ros.estimation.verdict.leverage import (
-    EXACT_SITES,
+    FEW_DRAWS,
     Alone,
     lines_alone,
     marks_alone,
@@ -61,9 +61,6 @@ from selfcal_ros.model.readings import (
 )
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Cause, Finding
-
-VIEW_DRAWS = 16
-"""Draws of unit noise in each view, to separate the noises of the views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +82,7 @@ def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     """Fit marks and lines, each by themselves, and return their residuals."""
     problem, _ = prepare(measurements, options)
     exact = measurements.artifact.map_grid is None and (
-        problem.system.grid.n_sites <= EXACT_SITES)
+        problem.system.grid.n_sites <= MAX_FULL)
     return Residuals(problem, marks_alone(problem.system, problem.grid.y, exact=exact),
                      lines_alone(problem.system, problem.angular.y))
 
@@ -124,11 +121,11 @@ def _mixing(system: NormalEquations) -> np.ndarray:
     grid, rng = system.grid, np.random.default_rng(0)
     mixing = np.zeros((grid.n_views, grid.n_views))
     for u in range(grid.n_views):
-        for _ in range(VIEW_DRAWS):
+        for _ in range(FEW_DRAWS):
             noise = np.zeros(grid.weight.shape, dtype=complex)
             noise[u] = noise_of(rng, noise[u].shape, grid.weight[u])
             rest = grid_residuals(system, noise)
-            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / VIEW_DRAWS
+            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / FEW_DRAWS
     return (mixing + mixing.T) / 2
 
 
@@ -381,8 +378,7 @@ LEFT = {"noisy_view", "too_many_outliers", "outliers_kept", "outliers_given_up",
 """Findings of faults that could not be corrected."""
 
 MAX_SLIPS = 3
-MAX_TERMS = 3
-"""Largest number of terms subtracted from the readings before the search for outliers."""
+"""Largest number of slips, and of terms that look like slips: more are another fault."""
 
 
 @dataclass(frozen=True)
@@ -454,7 +450,7 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
     """Return the readings split at slips, minus terms that explain them better than a slip."""
     flattened = _flattened(measurements, options)
     at = _Screened(measurements, flattened, residuals_of(flattened, linear))
-    for _ in range(MAX_SLIPS + MAX_TERMS + 1):
+    for _ in range(2 * MAX_SLIPS + 1):
         slip = find_slip(at.residuals, robust_sigma(at.residuals.marks), at.flattened)
         if slip is None:
             return at

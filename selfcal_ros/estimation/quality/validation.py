@@ -28,7 +28,7 @@ from selfcal_ros.errors import (
     NotSettledError,
 )
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.joint.problem import FLOOR
+from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess
 from selfcal_ros.estimation.lattice.readings import (
@@ -51,23 +51,18 @@ from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, reduce_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
-from selfcal_ros.estimation.verdict.leverage import noise_of
+from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, noise_of
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
 
-PREDICTION_LEVEL = 1e-3
-"""Probability that the prediction error of good readings exceeds its limit."""
-
 DRAWS = 200
 """Number of draws in a small field: 10 % uncertainty of the degrees of freedom."""
 
 READINGS_DRAWN = 2_000_000
 """Largest number of readings in all draws together: larger fields vary less."""
-
-MIN_DRAWS = 16
 
 RIGID_STEPS = 8
 """Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
@@ -226,9 +221,9 @@ class PredictionLimit:
     dof: float
 
     def ratio(self, noise_dof: float) -> float:
-        """Return the ratio of error to noise that is exceeded with probability PREDICTION_LEVEL."""
+        """Return the ratio of error to noise that is exceeded with probability F_LEVEL."""
         dof = min(noise_dof, MANY_DOF)
-        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - PREDICTION_LEVEL)))
+        return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - F_LEVEL)))
 
 
 def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
@@ -247,7 +242,7 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
         Their weights.
     """
     grid = model.problem.system.grid
-    n = int(np.clip(READINGS_DRAWN // grid.weight.size, MIN_DRAWS, DRAWS))
+    n = int(np.clip(READINGS_DRAWN // grid.weight.size, FEW_DRAWS, DRAWS))
     rng = np.random.default_rng(0)
     noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)

@@ -29,7 +29,7 @@ from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
 from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
-from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm
 
@@ -629,17 +629,14 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     return out
 
 
-SIZE_LEVEL = 5e-4
-"""Level of the test of each size."""
+CAUSE_LEVEL = 5e-4
+"""Level of the test of each size, and of each term, all parts of it that are tried together."""
 
 DOUBT_LEVEL = 0.1
 """Level below which the readings make a size doubtful, and a larger one is used instead: its upper
 limit with as much confidence, which is far above what few coefficients show."""
 
-BISECTIONS = 60
-"""Steps, on a logarithmic scale, to find a size to rounding."""
-
-TAIL = (1 - 0.9545) / 2
+TAIL = (1 - COVERAGE) / 2
 """Probability of a small statistic below which a size is too large."""
 
 
@@ -683,7 +680,7 @@ class SizeTest:
     @property
     def contradicted(self) -> bool:
         """Whether the readings rule out the size as too small."""
-        return self.p < SIZE_LEVEL
+        return self.p < CAUSE_LEVEL
 
     @property
     def raised(self) -> bool:
@@ -747,8 +744,7 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
 
     def size_at(level: float) -> float:
         low, high = term.size, float(beyond / np.sqrt(level))
-        for _ in range(BISECTIONS):
-            middle = float(np.sqrt(low * high))
+        while low < (middle := float(np.sqrt(low * high))) < high:
             low, high = (middle, high) if statistic(middle) > level else (low, middle)
         return high
 

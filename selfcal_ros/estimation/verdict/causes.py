@@ -26,6 +26,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.blocks import AXES, Located, block_of, blocks
+from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
@@ -35,9 +36,9 @@ from selfcal_ros.estimation.joint.problem import (
     pooled,
 )
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
-from selfcal_ros.estimation.terms.equations import Score, TermEquations, score
+from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, Score, TermEquations, score
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
-from selfcal_ros.estimation.verdict.leverage import lines_alone
+from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
@@ -138,9 +139,6 @@ def add_slip(made: ColumnBuilder, view: int, values: tuple[np.ndarray, np.ndarra
 
 OFF_SITES = "off_sites"
 
-ROUNDING_M = 1e-15
-"""Noise that replaces a noise of 0."""
-
 SMALL = 0.02
 """Change of the readings, in standard uncertainties of the map (rms), that is ignored."""
 
@@ -160,10 +158,6 @@ RMS_MATTERS = 0.5
 
 NODE_MATTERS = 2.0
 """Effect on a coordinate of a node, in its standard uncertainty, above which it is a cause."""
-
-
-DRAWS = 16
-"""Draws of noise from which the effect of the map's noise is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +210,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSi
     ratio = np.where(known, np.abs(_parts(moved)) / u, 0.0)
     if not (rms(ratio[:, known]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
         return None
-    noise = np.maximum(_noise(model, there, u), ROUNDING_M)
+    noise = np.maximum(_noise(model, there, u), FLOOR)
     effect = np.abs(_parts(moved))
     p = effect.size * math.erfc(float((effect / noise).max()) / math.sqrt(2))
     if p >= level:
@@ -255,11 +249,11 @@ def _noise(model: ModelFit, there: np.ndarray, u: np.ndarray) -> np.ndarray:
     places: Any = model.problem.places
     rng, at = np.random.default_rng(0), places.site
     total, n_sites = np.zeros((2, u[0].size)), u[0].size
-    for _ in range(DRAWS):
+    for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
         missed = _missed(model, drawn[0] + 1j * drawn[1], there)
         total += [np.bincount(at, part**2, n_sites) for part in _parts(missed)]
-    return np.sqrt(total / (DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))
+    return np.sqrt(total / (FEW_DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))
                    ).reshape(u.shape)
 
 
@@ -420,9 +414,6 @@ class Candidates:
                 return max(total, 0.0), both
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
 
-
-CAUSE_LEVEL = 5e-4
-"""Level of the test of each term, all parts of it that are tried together."""
 
 MAX_CAUSES = 4
 
@@ -640,10 +631,8 @@ def _explanation(pool: Candidates, taken: np.ndarray, group: Group, p: float) ->
 
 
 NOISY = 1.5
-"""Ratio of a view's noise to that of the others above which it is a cause."""
-
-SURE = 3.0
-"""Ratio of a rotation to its standard uncertainty above which the readings determine its view."""
+"""Ratio of a view's noise to that of the others, or of residuals to repeats, above which the
+uncertainty does not cover it."""
 
 
 def cause_of(found: Explanation, ground: TermInputs) -> Cause:
@@ -768,7 +757,7 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
     phi = [view.phi for view, readings in zip(result.views, measurements.views, strict=True)
            if len(readings.m) and len(readings.k)]
-    if not apart[of_u > SURE].max(initial=0.0) > np.ptp(phi) / 2:
+    if not apart[of_u > BEYOND].max(initial=0.0) > np.ptp(phi) / 2:
         return None
     p = math.erfc(float(of_u.max()) / math.sqrt(2))
     return replace(cause_of(held, model.problem.ground), p=p)

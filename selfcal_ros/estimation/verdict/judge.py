@@ -28,11 +28,12 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
-from selfcal_ros.estimation.joint.problem import NoiseEstimate, fit
+from selfcal_ros.estimation.joint.problem import SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL, LEAST_NOISE_M
+from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
@@ -40,6 +41,7 @@ from selfcal_ros.estimation.verdict.search import (
 )
 from selfcal_ros.estimation.verdict.uncertainty import (
     LACK_OF_FIT,
+    TOLD,
     Effect,
     budget_lines,
     enlarged,
@@ -53,10 +55,6 @@ from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
-MUCH_MORE = 1.1
-"""Ratio of the residuals of a linear model to those with finite rotations above which the linear
-model is a finding."""
-
 SIGN_U = 0.3
 """Standard uncertainty of the microscope's scale, by the joint fit alone, up to which the readings
 show the sign of the offsets."""
@@ -64,16 +62,8 @@ show the sign of the offsets."""
 HIDDEN = 1e-3
 """Share of the scale in an unobservable combination above which the scale is unknown."""
 
-FITTED = 0.5
-"""Ratio of the fitted to the assumed standard uncertainty of the microscope's scale below which
-the readings have determined it."""
-
 LACK_LEVEL = 0.02
 """Two-sided level from which residuals beyond the scatter of repeats count as lack of fit."""
-
-UNEXPLAINED = 1.5
-"""Ratio of the noise of residuals to that of repeats, without a cause that explains it, up to which
-the uncertainty from the residuals is taken to cover it."""
 
 FEW_OUTLIERS, MANY_OUTLIERS = 5, 0.1
 """Outliers among repeats of a view, and their part of its readings, that are not chance."""
@@ -189,7 +179,7 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
 def _unexplained_noise(solved: Solved) -> bool:
     """Return whether the noise is not known, or residuals are larger than U covers."""
     return not np.isfinite(solved.xy.sigma) or any(
-        noise.contradicted and noise.residuals > UNEXPLAINED * noise.known
+        noise.contradicted and noise.residuals > NOISY * noise.known
         for noise in (solved.xy, solved.theta))
 
 
@@ -212,7 +202,7 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
             measurements, replace(options, method="joint", misalignment_model="rigid"))
     except InputError:
         return solved
-    return rigid if MUCH_MORE * rigid.xy.residuals < linear.xy.residuals else linear
+    return rigid if SAME * rigid.xy.residuals < linear.xy.residuals else linear
 
 
 def _sign_findings(solved: Solved, measurements: Measurements,
@@ -284,7 +274,7 @@ def _scale_findings(solved: Solved, measurements: Measurements, options: Options
     u = 0.0 if term is None else term.size_of("scale")
     fitted = [estimate for each in solved.result.model.terms
               if term is not None and each.name == term.name for estimate in each.estimates
-              if estimate.component == "scale" and estimate.u < FITTED * u]
+              if estimate.component == "scale" and estimate.u < TOLD * u]
     if np.isinf(u) or fitted or any(
             cause.name in blocks() and blocks()[cause.name].of_offsets for cause in causes):
         return []

@@ -22,14 +22,14 @@ from selfcal_ros.estimation.normal.equations import (
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
 
-EXACT_SITES = 31 * 31
-"""Largest field whose leverages are computed exactly; in larger ones from seeded draws."""
-
 EXACT_LINES = 2048
 """Largest number of lines whose leverages are computed exactly; otherwise all have their mean."""
 
 N_DRAWS = 64
 """Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
+
+FEW_DRAWS = 16
+"""Draws of noise where a sum over many readings is wanted: one draw tells it to a few per cent."""
 
 CHECKED = 0.05
 """Smallest 1 - h of a reading that the others can check."""

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.joint.model_fit import (
     told_coefficients,
     with_map,
 )
-from selfcal_ros.estimation.joint.problem import FLOOR
+from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
@@ -36,9 +36,6 @@ from selfcal_ros.model.verdict import Cause
 
 NAME = "roughness"
 """Name of the cause, and of the effect."""
-
-ADEQUACY_LEVEL = 1e-3
-"""Probability that a map that suffices fails the test."""
 
 SIZES = (1e-2, 1e6, 65)
 """Trial sizes of the further coefficients, over the noise of the best one, and their number."""
@@ -90,7 +87,7 @@ class Adequacy:
     @property
     def cause(self) -> Cause | None:
         """The cause `roughness`, if the map does not suffice."""
-        if not self.p < ADEQUACY_LEVEL:
+        if not self.p < F_LEVEL:
             return None
         size: dict[str, Any] = {"harmonics": self.nodes[0]} if self.of_lines else {
             "nodes": list(self.nodes)}
@@ -127,17 +124,17 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if dof >= 1 and more >= 1:
         p = _improved(before, rest, more, dof)
         if p < 1.0:
-            y = other.y if p < ADEQUACY_LEVEL else model.y  # the terms of a map that suffices
+            y = other.y if p < F_LEVEL else model.y  # the terms of a map that suffices
             power = _Further.of(fine, coarse, y).power(
                 max(float(np.sqrt(rest / dof)), FLOOR))
-        power = power + _of_terms(model, other) ** 2 * (p < ADEQUACY_LEVEL)
+        power = power + _of_terms(model, other) ** 2 * (p < F_LEVEL)
     if bilinear and before > readings * FLOOR**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
         if (other := with_map(model, smooth)) is not None:
             rest = max(_squares(_of_marks(other), other.y), FLOOR * before)
             likelier = math.exp(min((readings - n[1]) / 2 * math.log(rest / before), 0.0))
             p, apart = min(p, likelier), _apart(other, model)
-            power = apart if likelier < ADEQUACY_LEVEL and apart.mean() > power.mean() else power
+            power = apart if likelier < F_LEVEL and apart.mean() > power.mean() else power
     local = np.zeros((2, *grid.views.shape))
     i, j = _halves(coarse)
     nodes = (i % 2 == 0) & (j % 2 == 0)

@@ -13,14 +13,14 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
+from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import finer
-from selfcal_ros.estimation.joint.solve import Solved, solve_joint
+from selfcal_ros.estimation.joint.solve import UNASKED_SITES, Solved, solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, SizeTest
+from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, LEAST_NOISE_M, SizeTest
 from selfcal_ros.estimation.verdict.causes import (
-    CAUSE_LEVEL,
+    MAX_CAUSES,
     READING,
-    SURE,
     Explanation,
     cause_of,
     find_explanations,
@@ -46,15 +46,9 @@ from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 ALWAYS_SITES = 41 * 41
 """Field up to which causes are always searched for; in a larger one only if a test fails."""
 
-MAX_SITES = 201 * 201
-"""Largest field in which causes are searched for at all."""
-
 MATTERS = 0.1
 """Effect on the map, in standard uncertainties (rms), below which a cause that the readings
 determine fully is ignored."""
-
-MAX_JOINED = 4
-"""Largest number of terms added to the model because the readings show them."""
 
 SURELY = 1e-6
 """Probability below which a term is there beyond doubt: not by chance in a million sessions."""
@@ -222,7 +216,7 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
     failed : bool
         Whether another test failed.
     """
-    if options.causes is False or sites > MAX_SITES:
+    if options.causes is False or sites > UNASKED_SITES:
         return False
     return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
@@ -231,7 +225,7 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
             failed: bool) -> None:
     """Add terms while the readings show any; then bound the effects of all other causes."""
     left: list[Explanation] = []
-    for _ in range(MAX_JOINED + 1):
+    for _ in range(MAX_CAUSES + 1):
         left = _explanations(found.solved, failed=failed)
         first = [item for item in left if item.rank == 0 and item.name in blocks()]
         if not first or not _join(found, first, measurements, options):
@@ -326,7 +320,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     if not _counts(held, solved):
         return None
     if block_of(test.name).between and abs(
-            (cause := cause_of(held, solved.joint.problem.ground)).size) > SURE * cause.u:
+            (cause := cause_of(held, solved.joint.problem.ground)).size) > BEYOND * cause.u:
         return cause  # otherwise the readings do not determine which view it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,

@@ -68,7 +68,7 @@ def test_the_noise_of_a_view_and_its_degrees_of_freedom(monkeypatch):
 
     A form y' A y of unit noise has the variance 2 tr(A A).
     """
-    monkeypatch.setattr(outliers, "VIEW_DRAWS", 1000)
+    monkeypatch.setattr(outliers, "FEW_DRAWS", 1000)
     readings = measured()
     found = view_noise(residuals_of(readings, LINEAR))
     left, y, of_view = dense(readings)

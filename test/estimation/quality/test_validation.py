@@ -134,7 +134,7 @@ LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 
 def test_the_limit_is_that_of_good_readings(monkeypatch):
     """At a level of 5 % as many good sets exceed it as should; at 0.1 % hardly any."""
-    monkeypatch.setattr("selfcal_ros.estimation.quality.validation.PREDICTION_LEVEL", 0.05)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.validation.F_LEVEL", 0.05)
     plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v, repeats in zip(
         SMALL.views, (1, 3, 1, 3, 2), strict=True)))
     found = [item for seed in range(8) for item in validate(
@@ -201,7 +201,7 @@ def test_terms_are_predicted_with_the_readings(few_draws):
 
 def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch):
     """Its own strain is unknown and as large as its size: one in twenty exceeds a limit of 5 %."""
-    monkeypatch.setattr(validation, "PREDICTION_LEVEL", 0.05)
+    monkeypatch.setattr(validation, "F_LEVEL", 0.05)
     strained = bare(terms=(ModelTerm("plate_strain", 5e-6),))
     spread = Spread(plate_strain=5e-6)
     found = [item for seed in range(8) for item in validate(

@@ -64,7 +64,7 @@ PLANS = {
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests (test_axes.py, test_sizes.py)."""
     monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
-    monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.SIZE_LEVEL)
+    monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.CAUSE_LEVEL)
 
 
 @cache
