@@ -99,7 +99,7 @@ def _say_better(stage: StageMap, points: np.ndarray) -> None:
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
     if stage.method == "bicubic" or not emap.valid.all() \
-            or not rms(plain) > 2 * rms(np.stack([emap.u_gx, emap.u_gy])):
+            or not rms(plain) > 2 * rms(emap.u_xy):
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:

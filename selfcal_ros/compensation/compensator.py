@@ -93,7 +93,7 @@ class Compensator:
         if method == "bicubic" and self._cells.largest_step > GENTLE * self._pitch \
                 and self._cells.steepest() > 2 * MAX_SLOPE * self._pitch:
             raise _steep_spline()
-        self._u_cells = bilinear_cells(np.stack([error_map.u_gx, error_map.u_gy]))
+        self._u_cells = bilinear_cells(error_map.u_xy)
         self._theta = Circle(error_map.g_theta, cubic=method == "bicubic",
                              harmonics=error_map.artifact.harmonics)
         self._u_theta = Circle(error_map.u_g_theta, cubic=False, harmonics=0)

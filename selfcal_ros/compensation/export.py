@@ -139,7 +139,7 @@ def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:
 def _uncertainty_line(result: CalibrationResult) -> str:
     if not result.has_uncertainty:
         return "uncertainty: not computed"
-    u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
+    u = result.error_map.u_xy
     return (f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
             f"k = {result.noise.k_xy:.3g} for 95.45 %")
 

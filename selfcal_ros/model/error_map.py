@@ -67,6 +67,11 @@ class ErrorMap:
     datum_theta: ThetaDatum = ThetaDatum.ZERO_MEAN
 
     @property
+    def u_xy(self) -> np.ndarray:
+        """Standard uncertainty of both coordinates, (2, nx, ny), m."""
+        return np.stack([self.u_gx, self.u_gy])
+
+    @property
     def valid(self) -> np.ndarray:
         """Sites whose error is known, bool (nx, ny)."""
         return np.isfinite(self.gx) & np.isfinite(self.gy)

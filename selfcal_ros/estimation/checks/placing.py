@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.checks.wiring import LEAST_MOTION
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import EDGE, LatticePose, PlacedPose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
@@ -37,8 +38,7 @@ CONTRADICTED = 4.0
 """Mean square above which another pose does not explain the readings either."""
 UNREPEATED = 0.1
 """Noise taken for readings without repeats, over the spread of stage and plate errors."""
-ROUNDING = 1e-13
-"""Spread of stage and plate errors, m, up to which it is rounding error."""
+
 FREE = 6
 """Number of complex columns of a view's own motion and shape."""
 BETTER = 30.0
@@ -137,7 +137,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
                                weights=[view.dof_xy for view in repeated])) if repeated else 0.0
     noise, spread = _sizes(views, float(sigma))
     noise = noise if repeated else UNREPEATED * spread
-    if not spread > max(2 * noise, ROUNDING):
+    if not spread > max(2 * noise, LEAST_MOTION):
         return None
     grid = artifact.map_grid
     sizes = max(noise, spread / 1000), spread, _alike(

@@ -27,8 +27,9 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion, ViewReadings
 
-WIRING_LEVEL = 1e-6
-"""Probability, over all tests, of refusing a correctly wired measurement."""
+BEYOND_DOUBT = 1e-6
+"""Probability, over all tests, below which a finding is beyond doubt, as that of a wrong wiring:
+not by chance in a million sessions."""
 TOLD = 1e-3
 """Probability below which a single offset is taken to follow a single axis wrongly."""
 SHOWN = 0.01
@@ -37,8 +38,7 @@ DOUBLED, HALVED = 1.5, 0.7
 """Scales beyond which an offset is in wrong units; nearer to 1 the scale is fitted."""
 BEYOND = 3.0
 """Standard uncertainties beyond which a value is not chance: 0.3 % of good ones are."""
-SCALE_LEVEL = 1e-3
-"""Probability, over both axes and both limits, of contradicting a correct scale."""
+
 LEAST_SLOPE = 0.3
 """Scale below which an offset is taken not to follow the stage."""
 LEAST_MOTION = 1e-12
@@ -116,7 +116,7 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
                 if (motion := getattr(view, name)) is not None and motion.dof > 1]
         tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(told) + 1)
         for view, motion in _together(told):
-            responses = _wrong(motion, AXES[kind], WIRING_LEVEL / tries)
+            responses = _wrong(motion, AXES[kind], BEYOND_DOUBT / tries)
             if responses:
                 found.append(WiringFault(view, kind, responses))
                 break
@@ -163,7 +163,7 @@ def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResp
     each = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
     axis, p = int(np.argmin(each)), min(*each, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
     return replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p) if (
-        6 * p < SCALE_LEVEL) else None
+        6 * p < TOLD) else None
 
 
 def _of_all_views(measurements: Measurements) -> RepeatMotion | None:

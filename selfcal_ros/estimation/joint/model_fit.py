@@ -25,6 +25,8 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
+    MAX_STEPS,
+    NEGLIGIBLE,
     ROUNDING,
     JointFit,
     Moving,
@@ -55,25 +57,16 @@ from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.terms import ModelTerm
 
-MAX_STEPS = 100
-
 RESOLUTION = 1e-12
 """Change of a reading, against the largest misalignment, at which rotations stand still."""
 
 ROUGH_RESOLUTION = 1e-11
 """The same once steps no longer shrink."""
 
-OF_NOISE = 1e-3
-"""Change, against its standard uncertainty, that is none once steps no longer shrink: rounding
-moves misalignments where weights lie far apart, or a term is hardly told."""
-
 LATE, OF_NOISE_LATE = 20, 0.1
-"""Steps after which rounding is all that moves, and the change that is none from then on: plates
-laid millimetres beside their places make the offsets, and their rounding, as large."""
-
-LINEAR = 1e-3
-"""Relative change of the misalignments' covariance, or of the weight of lines that have terms of
-their own, from which the terms' equations are set up anew."""
+"""Steps after which rounding is all that moves, and the change, against its standard uncertainty,
+that is none from then on: plates laid millimetres beside their places make the offsets, and their
+rounding, as large."""
 
 FEW_DOF = 10
 """Degrees of freedom of grid residuals below which those of lines count for the noise as well."""
@@ -171,7 +164,7 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         if change <= max(RESOLUTION * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
-        part = OF_NOISE if number < LATE else OF_NOISE_LATE
+        part = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
         if stuck and (change <= max(ROUGH_RESOLUTION * largest, FLOOR)
                       or state.within_noise(part)):
             return state.finished()
@@ -254,9 +247,9 @@ class _State:
         """Return whether the weights of angular readings differ from those in the equations."""
         now, then = self.found.inverse, self.weights
         if len(equations.columns.lines.at) and (
-                abs(self.found.ratio - self.ratio) > LINEAR * self.ratio):
+                abs(self.found.ratio - self.ratio) > NEGLIGIBLE * self.ratio):
             return True
-        return bool(np.abs(now - then).max() > LINEAR * np.abs(then).max())
+        return bool(np.abs(now - then).max() > NEGLIGIBLE * np.abs(then).max())
 
     def step(self) -> float:
         """Take one step; return the largest change of a misalignment or of a reading, m.

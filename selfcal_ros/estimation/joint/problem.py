@@ -37,6 +37,9 @@ MIN_REPEAT_DOF = 30
 F_LEVEL = 1e-3
 """Level of a test of all readings together: one good session in a thousand fails it."""
 
+NEGLIGIBLE = 1e-3
+"""Part of an uncertainty, or of what makes it, that changes no stated figure."""
+
 SAME = 1.1
 """Ratio of two noises up to which they count as equal, however significant the difference."""
 
@@ -570,8 +573,8 @@ FAR = 0.02
 SAMPLES = 1000
 """Fewest sites of all draws of noise together: enough for a ratio of sums of squares."""
 
-STEPS = 30
-"""Largest number of iterations for the map of a draw."""
+MAX_STEPS = 100
+"""Most steps of an iteration, of which good readings need a few."""
 
 SETTLED = 1e-2
 """Relative change of the map of a draw below which it has converged."""
@@ -645,7 +648,7 @@ def noise_gain(problem: Problem, found: JointFit) -> np.ndarray:
     for _ in range(math.ceil(SAMPLES / grid.n_sites)):
         y = spread * (rng.normal(size=spread.shape) + 1j * rng.normal(size=spread.shape))
         plain = now = fit(problem, y, still).field
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             changes = places.changes(places.moved(now, there), problem.turn_rad)
             before, now = now, fit(problem, y - changes, still).field
             if np.abs(now - before).max() <= SETTLED * np.abs(now).max():

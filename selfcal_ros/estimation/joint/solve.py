@@ -39,7 +39,13 @@ from selfcal_ros.estimation.joint.noise_effects import (
     image_variances,
     structured,
 )
-from selfcal_ros.estimation.joint.problem import NoiseEstimate, Problem, noise_gain, problem_of
+from selfcal_ros.estimation.joint.problem import (
+    NEGLIGIBLE,
+    NoiseEstimate,
+    Problem,
+    noise_gain,
+    problem_of,
+)
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations, PlacedEquations, system_for
@@ -205,9 +211,6 @@ MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 
 OF_OFFSETS = "microscope"
 """Key of what factors make of them."""
-
-NEGLIGIBLE = 1e-3
-"""Length of a factor, in units of the noise, that changes no uncertainty by a thousandth."""
 
 ANGULAR_KEY = "angular_terms"
 """Key of each term's contribution to the standard uncertainty of the angular map, rad."""

@@ -266,7 +266,7 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
 
     If it was not computed, that of a mean reading, which a map from three views comes close to.
     """
-    u, grid = np.stack([error_map.u_gx, error_map.u_gy]), model.problem.system.grid
+    u, grid = error_map.u_xy, model.problem.system.grid
     if not np.isfinite(u).any():
         return np.full_like(u, model.found.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
     u = np.nan_to_num(u, nan=rms(u))

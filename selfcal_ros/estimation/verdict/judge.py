@@ -28,7 +28,7 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
-from selfcal_ros.estimation.joint.problem import SAME, NoiseEstimate, fit
+from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -58,9 +58,6 @@ from selfcal_ros.units import NS_PER_S
 SIGN_U = 0.3
 """Standard uncertainty of the microscope's scale, by the joint fit alone, up to which the readings
 show the sign of the offsets."""
-
-HIDDEN = 1e-3
-"""Share of the scale in an unobservable combination above which the scale is unknown."""
 
 LACK_LEVEL = 0.02
 """Two-sided level from which residuals beyond the scatter of repeats count as lack of fit."""
@@ -224,7 +221,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
              if equations.columns.columns[at].component == "scale"]
     if not scale or not np.isfinite(model.found.xy.sigma):
         return []
-    hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > HIDDEN
+    hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > NEGLIGIBLE
     variance = equations.free_inverse[scale[0], scale[0]] * model.found.xy.sigma**2
     return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.checks.wiring import BEYOND
+from selfcal_ros.estimation.checks.wiring import BEYOND, BEYOND_DOUBT
 from selfcal_ros.estimation.joint.model_fit import finer
 from selfcal_ros.estimation.joint.solve import UNASKED_SITES, Solved, solve_joint
 from selfcal_ros.estimation.options import Options
@@ -49,9 +49,6 @@ ALWAYS_SITES = 41 * 41
 MATTERS = 0.1
 """Effect on the map, in standard uncertainties (rms), below which a cause that the readings
 determine fully is ignored."""
-
-SURELY = 1e-6
-"""Probability below which a term is there beyond doubt: not by chance in a million sessions."""
 
 
 @dataclass(eq=False)
@@ -184,7 +181,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
         tried = replace(options, terms=merged(options.terms, terms))
         if (solved := _uncontradicted(measurements, tried)) is not None:
             emap = solved.result.error_map
-            u = rms(np.stack([emap.u_gx, emap.u_gy])) + np.nan_to_num(rms(emap.u_g_theta))
+            u = rms(emap.u_xy) + np.nan_to_num(rms(emap.u_g_theta))
             if u < least:
                 best, least = ",".join(map(str, tried.terms)), u
     return best
@@ -311,7 +308,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     """Return a contradicted size of a term as a cause; None if it does not matter."""
     term = next(term for term in solved.result.model.terms if term.name == test.name)
     parts = enlargements(solved.result, [term.name], [])
-    u = rms(np.stack([solved.result.error_map.u_gx, solved.result.error_map.u_gy]))
+    u = rms(solved.result.error_map.u_xy)
     of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
     # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
@@ -330,10 +327,10 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
 def _beyond_u(solved: Solved, test: SizeTest) -> bool:
     """Return whether a term is surely there, and what no reading determines of it exceeds u."""
     term = next(term for term in solved.result.model.terms if term.name == test.name)
-    if not test.p_together < SURELY or test.rank == len(term.estimates):
+    if not test.p_together < BEYOND_DOUBT or test.rank == len(term.estimates):
         return False
     emap = solved.result.error_map
-    whole = {"m": rms(np.stack([emap.u_gx, emap.u_gy])), "rad": rms(emap.u_g_theta)}
+    whole = {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)}
     return any(2 * part.u_rms**2 > whole[part.unit]**2
                for part in enlargements(solved.result, [term.name], []))
 
@@ -383,6 +380,6 @@ def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
     emap, noisy = found.solved.result.error_map, noisier_views(views)
     largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
     if (ratio := largest / found.solved.xy.sigma) > 1:
-        more = np.nan_to_num(np.stack([emap.u_gx, emap.u_gy])) * np.sqrt(ratio**2 - 1)
+        more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)
         found.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
     found.causes += sorted(noisy, key=lambda cause: cause.p)

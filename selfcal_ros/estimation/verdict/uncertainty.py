@@ -166,7 +166,7 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
                     if _not_told(terms.get(name))), np.zeros(emap.u_g_theta.shape))
     changed: dict[str, float] = {}
     for kind, power, known in (
-            ("xy", np.stack([emap.u_gx, emap.u_gy]) ** 2, known_beforehand(result)),
+            ("xy", emap.u_xy ** 2, known_beforehand(result)),
             ("theta", emap.u_g_theta ** 2, of_lines)):
         dof, at = getattr(noise, f"dof_{kind}"), np.isfinite(power)
         if dof > 0 and known[at].any():
@@ -239,7 +239,7 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     """
     lines, found = result.budget or tuple(budget_lines(result)), []
     emap = result.error_map
-    for quantity, u in (("xy", np.stack([emap.u_gx, emap.u_gy])), ("theta", emap.u_g_theta)):
+    for quantity, u in (("xy", emap.u_xy), ("theta", emap.u_g_theta)):
         dof = _or_infinite(result.noise.dof_of(quantity))
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
@@ -260,7 +260,7 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     emap, noise = result.error_map, result.noise
     if not result.has_uncertainty:
         return
-    power = np.stack([emap.u_gx, emap.u_gy]) ** 2
+    power = emap.u_xy ** 2
     of_terms, of_reference = variance_of_terms(result), variance_of_reference(result)
     # the uncertainty of the map includes those of reference and terms, which have their own lines
     power = power - sum(of_terms.values()) - of_reference

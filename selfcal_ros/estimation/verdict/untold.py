@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from selfcal_ros.estimation.joint.model_fit import equations_of
+from selfcal_ros.estimation.joint.problem import NEGLIGIBLE
 from selfcal_ros.estimation.joint.solve import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
@@ -17,9 +18,6 @@ from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
 from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_of_field
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.terms import UNTOLD, nominal_terms
-
-SMALL = 1e-3
-"""Part of the largest effect of a term below which a combination of its coefficients has none."""
 
 
 def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
@@ -48,7 +46,7 @@ def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
         return
     columns = term_columns(problem.ground, (*problem.terms, *more))
     equations = equations_of(problem, model.found, columns)
-    least = UNTOLD * rms(np.stack([emap.u_gx, emap.u_gy]))
+    least = UNTOLD * rms(emap.u_xy)
     for term in more:
         fields = _added(equations, columns.rows([term.name]), model.covariance,
                         model.found.xy.sigma)
@@ -77,7 +75,7 @@ def _added(equations: TermEquations, rows: np.ndarray, held: np.ndarray,
     moved[~equations.system.known_sites.ravel()] = 0.0
     both = np.concatenate([moved.real, moved.imag])
     left_maps, sizes, _ = np.linalg.svd(both, full_matrices=False)
-    kept = (left_maps * sizes)[:, sizes > SMALL * sizes.max(initial=0.0)].T
+    kept = (left_maps * sizes)[:, sizes > NEGLIGIBLE * sizes.max(initial=0.0)].T
     nodes = len(moved)
     return (kept[:, :nodes] + 1j * kept[:, nodes:]).reshape(
         -1, *equations.system.known_sites.shape)

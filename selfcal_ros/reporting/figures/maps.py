@@ -150,7 +150,7 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     step = sites[0].step or 1
     length = np.hypot(emap.gx, emap.gy)
-    U = np.stack([emap.u_gx, emap.u_gy]) * k
+    U = emap.u_xy * k
     factor = parts.enlargement(np.fmax(np.fmax(length, largest_m), U.max(axis=0)),
                                step * artifact.grid_pitch_m)
 
@@ -251,7 +251,7 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
     """
     emap, k = result.error_map, result.noise.k_xy
     errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
-    u = np.where(emap.valid, np.stack([emap.u_gx, emap.u_gy]), np.nan) * k * UM_PER_M
+    u = np.where(emap.valid, emap.u_xy, np.nan) * k * UM_PER_M
     end, side, gap, left, top = parts.round_end(errors), 158.0, 44.0, 44.0, 50.0
     drawing = parts.titled(
         "components" if of == "stage" else f"{of}-components",

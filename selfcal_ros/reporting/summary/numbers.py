@@ -240,7 +240,7 @@ def map_figures(emap: ErrorMap) -> MapFigures:
     """Return the figures of an error map; unknown sites and lines do not count."""
     known = emap.valid
     g = np.stack([emap.gx, emap.gy])[:, known]
-    u = np.stack([emap.u_gx, emap.u_gy])[:, known]
+    u = emap.u_xy[:, known]
     max_error, index = largest(np.where(known, np.hypot(emap.gx, emap.gy), np.nan))
     max_theta, line = largest(emap.g_theta)
     u_theta = emap.u_g_theta[np.isfinite(emap.g_theta)]
@@ -283,7 +283,7 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     difference[:, ~np.isfinite(difference).all(axis=0)] = np.nan
     longest, index = largest(np.hypot(*difference))
     xy = (longest, _site(emap, index), rms(difference),
-          *_in_units(difference, np.stack([emap.u_gx, emap.u_gy])))
+          *_in_units(difference, emap.u_xy))
     if "g_theta" not in true:
         return TruthFigures(*xy)
     theta = emap.g_theta - true["g_theta"]
