@@ -113,9 +113,9 @@ class NoiseEstimate:
         return coverage_factor(self.dof) if self.dof > 0 else float("nan")
 
 
-def coverage_factor(dof: float, probability: float = COVERAGE) -> float:
-    """Return k such that value +- k u covers the truth with `probability` (Student's t)."""
-    return float(stdtrit(min(dof, MANY_DOF), (1 + probability) / 2))
+def coverage_factor(dof: float) -> float:
+    """Return k such that value +- k u covers the truth with `COVERAGE` (Student's t)."""
+    return float(stdtrit(min(dof, MANY_DOF), (1 + COVERAGE) / 2))
 
 
 def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:

@@ -21,12 +21,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from selfcal_ros.blocks import block_of
-from selfcal_ros.errors import (
-    InputError,
-    NoDataError,
-    NotIdentifiableError,
-    NotSettledError,
-)
+from selfcal_ros.errors import NoDataError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
 from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
@@ -322,7 +317,7 @@ def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale[:, None]
 
 
-MAX_FOLDS = 10
+TENTHS = 10
 
 NOTHING = float("nan")
 
@@ -367,41 +362,33 @@ class HeldOut:
 
 
 @one_thread()
-def validate(measurements: Measurements, options: Options | None = None, *, seed: int = 0,
-             folds: int = 3) -> list[HeldOut]:
+def validate(measurements: Measurements, options: Options, *, folds: int = 3) -> list[HeldOut]:
     """Hold out random tenths and whole views in turn, and predict them.
 
     Parameters
     ----------
     measurements : Measurements
         All readings.
-    options : Options, optional
+    options : Options
         As for `calibrate`; uncertainties are not computed, the method is ``joint``.
-    seed : int
-        Seed of the random tenths.
     folds : int
-        Number of random tenths, 1 to 10; they do not overlap.
+        Number of random tenths, at most 10; they do not overlap.
 
     Raises
     ------
-    InputError
-        If `folds` is out of range.
     NoDataError, NotIdentifiableError
         As `calibrate`, for all readings.
     """
-    if not 1 <= folds <= MAX_FOLDS:
-        raise InputError("folds", f"{folds} is not a number from 1 to {MAX_FOLDS}",
-                         "give a number of tenths")
     # a pure datum: half axes that lose a mark would not do for xy_axes
-    options = replace(options or Options(), method="joint", uncertainty=False, causes=False,
+    options = replace(options, method="joint", uncertainty=False, causes=False,
                       datum_theta=ThetaDatum.ZERO_MEAN)
     fit_joint(measurements, options)  # refuses what cannot be solved as a whole
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     group = []
     for view in measurements.views:
         # drawn in the order of the lattice: the order of the readings changes nothing
         ranks = (np.lexsort((view.n, view.m)).argsort(), np.argsort(view.k).argsort())
-        group.append(tuple((rng.permutation(len(rank)) % MAX_FOLDS)[rank] for rank in ranks))
+        group.append(tuple((rng.permutation(len(rank)) % TENTHS)[rank] for rank in ranks))
     out = []
     for fold in range(folds):
         chosen = [(grid == fold, lines == fold) for grid, lines in group]

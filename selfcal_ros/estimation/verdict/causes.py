@@ -182,7 +182,7 @@ class OffSites:
     bounded: bool
 
 
-def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSites | None:
+def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     """Return the effect of a stage off the sites as a cause; None if it is small.
 
     Parameters
@@ -191,8 +191,6 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSi
         The fit; views whose visits are unknown count as measured at the sites.
     error_map : ErrorMap
         Its map.
-    level : float
-        Level of the test against the noise of the map.
     """
     problem, places = model.problem, model.problem.places
     if places is None:
@@ -213,7 +211,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap, level: float) -> OffSi
     noise = np.maximum(_noise(model, there, u), FLOOR)
     effect = np.abs(_parts(moved))
     p = effect.size * math.erfc(float((effect / noise).max()) / math.sqrt(2))
-    if p >= level:
+    if p >= CAUSE_LEVEL:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
     cause = Cause(OFF_SITES, float(effect[worst]), float(noise[worst]), "m", p,
@@ -763,12 +761,12 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     return replace(cause_of(held, model.problem.ground), p=p)
 
 
-def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cause | None:
+def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
     """Return the reading of a line that contradicts the others most; None if none does.
 
     Lines are fitted without marks. The error of a reading is its residual over 1 - h, the part that
     the fit does not follow; the reduction of the sum of squares is tested against the remainder
-    (F-test; the level is that of all lines together). Lines are tested against no less noise than
+    (F-test at the level of all lines together). Lines are tested against no less noise than
     that with which they are weighted.
 
     Parameters
@@ -777,8 +775,6 @@ def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cau
         The fit of marks and lines.
     measurements : Measurements
         Readings, for the names of the views.
-    level : float
-        Level of the test.
     """
     problem = model.problem
     lines = lines_alone(problem.system, problem.angular.y)
@@ -794,4 +790,4 @@ def line_cause(model: ModelFit, measurements: Measurements, level: float) -> Cau
     u = lines.noise_without((v, k), least) / math.sqrt(lines.weight[v, k] * checked)
     view = measurements.views[problem.angular.index[v]].view.name
     return Cause(READING, float(lines.residual[v, k] / checked), u, "rad", p, view,
-                 mark=(k,)) if p < level else None
+                 mark=(k,)) if p < CAUSE_LEVEL else None

@@ -17,7 +17,7 @@ from selfcal_ros.estimation.checks.wiring import BEYOND, BEYOND_DOUBT
 from selfcal_ros.estimation.joint.model_fit import finer
 from selfcal_ros.estimation.joint.solve import UNASKED_SITES, Solved, solve_joint
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, LEAST_NOISE_M, SizeTest
+from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, SizeTest
 from selfcal_ros.estimation.verdict.causes import (
     MAX_CAUSES,
     READING,
@@ -96,7 +96,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         return found
     sizes = [test for test in solved.model.sizes if test.contradicted]
     place = None if measurements.artifact.map_grid else off_sites_cause(
-        solved.model, solved.result.error_map, CAUSE_LEVEL)
+        solved.model, solved.result.error_map)
     failed = failed or bool(sizes or place)
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
@@ -230,7 +230,7 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
         failed = False
     for item in left:
         _bound(found, item, measurements)
-    if (line := line_cause(found.solved.joint, measurements, CAUSE_LEVEL)) is not None:
+    if (line := line_cause(found.solved.joint, measurements)) is not None:
         found.causes.append(line)
         lines = measurements.artifact.angular_count  # the error of a reading at most
         found.effects.append(Effect(

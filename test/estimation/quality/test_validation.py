@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
+from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.quality import validation
 from selfcal_ros.estimation.quality.validation import (
@@ -226,15 +226,11 @@ def test_lines_are_predicted_with_the_eccentricity_of_their_view(sense, few_draw
     assert validate(readings, BARE, folds=1)[0].rms_rad > 5e-6
 
 
-def test_seeds_and_folds(few_draws):
+def test_tenths_do_not_overlap(few_draws):
     readings = drawn(0, SMALL)
     assert validate(readings, BARE, folds=1) == validate(readings, BARE, folds=1)
-    assert validate(readings, BARE, folds=1)[0] != validate(readings, BARE, folds=1, seed=1)[0]
     tenths = [item for item in validate(readings, BARE, folds=10) if item.tenth]
     assert sum(item.n_grid for item in tenths) <= sum(len(v.m) for v in readings.views)
-    for folds in (0, 11):
-        with pytest.raises(InputError, match="number from 1 to 10"):
-            validate(readings, BARE, folds=folds)
 
 
 def test_text_and_json(few_draws):
