@@ -25,7 +25,7 @@ from test.support.placed import SIX, THREE, dense, error_in_datum, plate, readin
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
-COUNT = 12
+COUNT = 8
 HOLES = (0, 3, 17, 24, 25, 31, 40, 48)
 PLATES = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, HOLES),
           "even": lambda: lattice(8)}

@@ -25,7 +25,7 @@ from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
 LINEAR = bare(causes=False, at_places=False, misalignment_model="linear")
-RUNS = 7
+RUNS = 5
 
 
 def sessions(image_m, seed, *, size=7, turn=0, repeats=1, change=0.0, missing=0.0,

@@ -24,7 +24,7 @@ from test.support.truth import random_truth, simulate_measurements
 PLAN = plan_of("0,90,tx", Artifact(5, 0.01))
 EXPANSION, U_EXPANSION, U_KELVIN = 8e-6, 4e-7, 0.05
 LENGTH, U_LENGTH = 2e-6, 2e-7
-STAGES = 12
+STAGES = 8
 
 
 def of_length(truth, scale):
