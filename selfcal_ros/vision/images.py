@@ -5,6 +5,7 @@ The fields are checked before memory is allocated.
 """
 
 import io
+import math
 import warnings
 from collections.abc import Buffer, Callable
 from typing import Any, NamedTuple
@@ -25,9 +26,10 @@ FORMATS = ("PNG", "JPEG", "TIFF")
 """Formats that are decoded. Pillow starts programs for some others."""
 SAVE_AS = "give PNG, JPEG or TIFF: grey of 8 or 16 bits, or colour of 8"
 ORIENTATION, BITS, PHOTOMETRIC, SAMPLE_FORMAT = 274, 258, 262, 339
+COMPRESSION, SAMPLES, STRIP_BYTES = 259, 277, 279
 """Tags of EXIF and TIFF."""
-WHITE_IS_ZERO, SIGNED = 0, 2
-"""Values of PHOTOMETRIC and SAMPLE_FORMAT."""
+WHITE_IS_ZERO, SIGNED, UNCOMPRESSED = 0, 2, 1
+"""Values of PHOTOMETRIC, SAMPLE_FORMAT and COMPRESSION."""
 GREY_MODES = {"L": np.uint8, "I;16": np.uint16, "I;16B": np.uint16, "I": np.uint16}
 """Modes of Pillow with one value per pixel; those of 16 bits in I, too."""
 
@@ -120,7 +122,7 @@ def _values(picture: Image.Image) -> Picture:
     """Return the grey values; ValueError for those that Pillow would turn, cut or invert."""
     stored = str(getattr(picture, "tile", ""))  # before it is decoded
     tags = getattr(picture, "tag_v2", {})  # of a TIFF
-    bits = max(tags.get(BITS, (0,)))
+    bits = max(tags.get(BITS, (1,)))
     signed = SIGNED in tags.get(SAMPLE_FORMAT, ())
     if picture.mode == "F":
         raise ValueError("floating-point values, whose black and white are unknown")
@@ -130,6 +132,10 @@ def _values(picture: Image.Image) -> Picture:
         raise ValueError("white is 0")
     if signed and bits <= 8:
         raise ValueError("signed values")
+    row = math.ceil(picture.width * bits * tags.get(SAMPLES, 1) / 8)
+    stored_rows = sum(tags.get(STRIP_BYTES, ())) // max(row, 1)
+    if tags.get(COMPRESSION) == UNCOMPRESSED and stored_rows > picture.height:
+        raise ValueError(f"{stored_rows} rows of pixels instead of {picture.height}")
     if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[:, :, 3].min() < 255:
         raise ValueError("transparent pixels")
     if picture.mode not in GREY_MODES:

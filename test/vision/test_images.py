@@ -180,6 +180,11 @@ def test_the_full_scale_is_that_of_the_bits():
     assert decoded(tiff(WIDE, (339, 2)), "f.tif").full_scale == 32767
 
 
+def test_a_tiff_of_one_bit_without_a_tag_for_it():
+    data = saved(Image.fromarray((GREY > 5).astype(np.uint8) * 255).convert("1"), "TIFF")
+    assert (decoded(data, "f.tif").values == (GREY > 5) * 765).all()
+
+
 def test_white_is_0_in_8_bits_is_turned_round():
     assert (decoded(tiff(GREY, (262, 0)), "f.tif").values == 255 - GREY).all()
 
@@ -187,6 +192,8 @@ def test_white_is_0_in_8_bits_is_turned_round():
 @pytest.mark.parametrize(("data", "problem"), [
     (tiff(WIDE, (262, 0)), "white is 0"), (tiff(GREY, (339, 2)), "signed values"),
     (tiff(WIDE - 1, (339, 2)), "values beyond 16 bits"),
+    (tiff(GREY, (256, 2)), "6 rows of pixels instead of 3"),
+    (tiff(WIDE, (257, 2)), "3 rows of pixels instead of 2"),
     (tiff(GREY, (274, 6)), "its EXIF orientation is not 1"),
     (png(2, 16, COLOUR_16), "16 bits in the mode RGB"),
     (png(4, 16, GREY_ALPHA_16), "16 bits in the mode"),
