@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from selfcal_ros.compensation.cells import SNAP, Interpolation, Outside, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.results import read_result
@@ -154,7 +154,7 @@ class StageMap(Compensator):
         if not self.error_map.valid.ravel()[used].all():
             raise InputError("covariance", "a point lies next to an unknown site",
                              "leave the point out, or measure the site")
-        sites = xy_covariance(self.result, used.reshape(self.error_map.artifact.shape))
+        sites = covariance_of(self.result, "xy", used.reshape(self.error_map.artifact.shape))
         if sites.ndim == 1:
             raise InputError("covariance", "the result does not contain the correlations of its "
                              "sites", "solve again with uncertainties; fields beyond 31 x 31 "

@@ -13,7 +13,7 @@ from selfcal_ros import apply
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
@@ -52,14 +52,14 @@ def test_at_the_nodes_the_covariance_has_the_variances_of_the_map(file, result):
     found = load(file).covariance(plate.x_m, plate.y_m)
     np.testing.assert_allclose(np.sqrt(np.diag(found)),
                                [*emap.u_gx.ravel(), *emap.u_gy.ravel()], rtol=1e-9)
-    np.testing.assert_allclose(found, xy_covariance(result, emap.valid), rtol=0,
+    np.testing.assert_allclose(found, covariance_of(result, "xy", emap.valid), rtol=0,
                                atol=1e-9 * found.max())
 
 
 def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
     """Against draws of the whole map, each interpolated by the compensator itself."""
     emap, plate = result.error_map, result.artifact
-    full = xy_covariance(result, emap.valid)
+    full = covariance_of(result, "xy", emap.valid)
     rng = np.random.default_rng(1)
     draws = rng.multivariate_normal(np.zeros(len(full)), full, 20_000, method="eigh")
     pitch = plate.grid_pitch_m
@@ -111,7 +111,7 @@ def test_the_error_of_a_distance_is_that_of_its_ends(file, result):
     d = np.array([x2 - x1, y2 - y1])
     g = np.array([field[4, 2] - field[1, 1] for field in (emap.gx, emap.gy)])
     assert error == pytest.approx([d @ g / np.hypot(*d)], abs=1e-11) and abs(error[0]) > 1e-8
-    full, known = xy_covariance(result, emap.valid), np.zeros((2, 2, *plate.shape))
+    full, known = covariance_of(result, "xy", emap.valid), np.zeros((2, 2, *plate.shape))
     for axis in (0, 1):
         known[axis, axis, 4, 2], known[axis, axis, 1, 1] = 1, -1
     row = (d / np.hypot(*d)) @ known.reshape(2, -1)
@@ -227,7 +227,7 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
 
 def stage_of(plate, covariance, monkeypatch, halfway=((0, 0), (0, 0))):
     """Return a stage whose sites have this covariance of Gx, then Gy."""
-    monkeypatch.setattr("selfcal_ros.apply.xy_covariance", lambda _, used:
+    monkeypatch.setattr("selfcal_ros.apply.covariance_of", lambda _, kind, used:
                         covariance[np.ix_(*[np.tile(used.ravel(), 2)] * 2)])
     stage = StageMap(result_of(random_map(plate, 1)))
     stage.halfway = np.array(halfway, dtype=float)

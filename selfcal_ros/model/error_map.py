@@ -76,6 +76,12 @@ class ErrorMap:
         """Sites whose error is known, bool (nx, ny)."""
         return np.isfinite(self.gx) & np.isfinite(self.gy)
 
+    def of(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return one of the maps and its u, (2, nx, ny) of ``xy``, (1, K) of ``theta``."""
+        if kind == "xy":
+            return np.stack([self.gx, self.gy]), np.stack([self.u_gx, self.u_gy])
+        return self.g_theta[None], self.u_g_theta[None]
+
 
 def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
     """Return the rigid modes of a map, (modes, 2, nx, ny): two translations, rotation, scale.
@@ -91,6 +97,27 @@ def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
     one, zero = np.ones(artifact.shape), np.zeros(artifact.shape)
     modes = [(one, zero), (zero, one), (-y, x)]
     return np.array([*modes, (x, y)] if scale else modes)
+
+
+def datum_columns(artifact: Artifact, kind: str, known: np.ndarray, *,
+                  scale: bool) -> np.ndarray:
+    """Return the modes of the datum over known places as columns, (values, modes).
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Lattice of the map.
+    kind : str
+        ``xy``, or ``theta``, whose datum is a constant.
+    known : bool array (nx, ny) or (K,)
+        Places of the values: Gx, then Gy of these sites, or these lines.
+    scale : bool
+        Whether magnification belongs to the datum.
+    """
+    if kind == "theta":
+        return np.ones((int(known.sum()), 1))
+    modes = datum_modes(artifact, scale=scale)[:, :, known]
+    return modes.reshape(len(modes), -1).T
 
 
 def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:

@@ -38,6 +38,37 @@ class Sense(StrEnum):
     PLATE_MOVES = "plate_moves"
 
 
+def turned_over(sense: str, field: np.ndarray, *, sign: int = -1,
+                axes: tuple[int, int] = (-2, -1)) -> np.ndarray:
+    """Return what the map of the stage is of the solved one, or the solved of that of the stage.
+
+    With ``plate_moves`` the equations are solved for H(X) = -G(-X) (method eq. 1.6).
+
+    Parameters
+    ----------
+    sense : str
+        What moves.
+    field : array (..., nx, ny)
+        The map, or rows of functionals of it.
+    sign : int
+        1 for what has no sign: u, or which sites are known.
+    axes : tuple of int
+        The axes of x and y.
+    """
+    if sense != Sense.PLATE_MOVES:
+        return field
+    flipped = np.flip(field, axes)
+    return flipped if sign > 0 else -flipped
+
+
+def lines_turned_over(sense: str, values: np.ndarray, *, sign: int = -1) -> np.ndarray:
+    """Return the same of the angular map, (K, ...): Htheta(k) = -Gtheta(-k)."""
+    if sense != Sense.PLATE_MOVES:
+        return values
+    flipped = np.roll(values[::-1], 1, axis=0)
+    return flipped if sign > 0 else -flipped
+
+
 def _empty(kind: type) -> Any:
     return field(default_factory=lambda: np.zeros(0, dtype=kind))
 

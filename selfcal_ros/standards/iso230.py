@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 
 DRAWS = 2000
@@ -314,7 +314,7 @@ def _map_draws(stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int)
     emap = stage.error_map
     chosen = np.zeros(emap.artifact.shape, dtype=bool)
     chosen[place] = True
-    cover = xy_covariance(stage.result, chosen)
+    cover = covariance_of(stage.result, "xy", chosen)
     n = int(chosen.sum())
     part = slice(axis * n, (axis + 1) * n)
     own = cover[part, part] if cover.ndim == 2 else np.diag(cover[part])

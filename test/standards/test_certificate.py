@@ -18,7 +18,7 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Part, combine
-from selfcal_ros.estimation.comparison.covariance import first_order_u, xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
@@ -121,7 +121,7 @@ def test_the_covariance_is_written_on_request():
     found = [values(column, "si:covarianceXMLList/si:valueXMLList")
              for column in item.iter(f"{{{SI}}}columnXMLList")]
     known = np.ones(RESULT.artifact.shape, dtype=bool)
-    np.testing.assert_allclose(found, xy_covariance(RESULT, known), rtol=1e-7, atol=1e-26)
+    np.testing.assert_allclose(found, covariance_of(RESULT, "xy", known), rtol=1e-7, atol=1e-26)
     apart = replace(RESULT, views=())
     text = ET.tostring(written(apart), encoding="unicode")
     assert "correlations between nodes are not known" in text and not named(ET.fromstring(text),
@@ -394,7 +394,7 @@ def test_a_mean_is_traceable_if_all_its_runs_are():
 def test_a_mean_has_u_of_its_squareness():
     mean = worded(combine([run(5), run(6)]).result)
     value, U_O, k = scalar(written(mean), "non-orthogonality O")
-    cover = xy_covariance(mean, np.ones((5, 5), dtype=bool))
+    cover = covariance_of(mean, "xy", np.ones((5, 5), dtype=bool))
     at = mean.artifact
     columns = np.array([np.concatenate([a.ravel(), b.ravel()]) for a, b in (
         (at.y_m, at.x_m), (at.x_m, -at.y_m), (at.x_m, at.y_m), (-at.y_m, at.x_m),
@@ -541,7 +541,7 @@ def test_the_certificate_of_a_recheck_has_u_of_squareness_and_correlations():
                     ("scale difference R", u_r)):
         [item] = named(root, name)
         assert float(item.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(k * u)
-    cover = xy_covariance(after, after.error_map.valid)
+    cover = covariance_of(after, "xy", after.error_map.valid)
     u = np.concatenate([after.error_map.u_gx.ravel(), after.error_map.u_gy.ravel()])
     np.testing.assert_allclose(np.sqrt(np.diag(cover)), u, rtol=1e-6)
     assert u_o > 0 and [*named(root, "a"), *named(root, "Gx, then Gy")]

@@ -6,8 +6,9 @@ common to all runs of one machine (covariance K; s_i = 1, or 0 for a run of othe
 the part between runs. Its covariance T has one variance for each given shape, and one for the rest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,15 @@ from scipy.special import fdtrc
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.covariance import (
-    kept_covariance,
-    theta_covariance,
-    xy_covariance,
-)
+from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariance
 from selfcal_ros.estimation.comparison.maps import (
+    KINDS,
     Spread,
+    joint_dof,
     require_same_lattice,
     significance,
+    variances,
+    variances_of,
     without,
 )
 from selfcal_ros.estimation.joint.problem import coverage_factor
@@ -41,8 +42,7 @@ from selfcal_ros.model.error_map import (
     MANY_DOF,
     ErrorMap,
     ThetaDatum,
-    datum_modes,
-    remove_modes,
+    datum_columns,
     rms,
 )
 from selfcal_ros.model.recheck import Significance
@@ -86,32 +86,41 @@ class Part:
     result: CalibrationResult | None = None
 
 
-def require_own_readings(parts: Sequence[Part], known: np.ndarray, modes: np.ndarray) -> None:
-    """Refuse a map that equals another but for its datum, or has another unit or sign."""
-    emaps = [part.error_map for part in parts]
-    u = [np.stack([emap.u_gx, emap.u_gy]) for emap in emaps]
-    maps = [remove_modes(np.where(known, np.stack([emap.gx, emap.gy]), np.nan), modes)
-            for emap in emaps]
-    lines = [np.diff(emap.g_theta) for emap in emaps]
+def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray], *,
+                         scale: bool) -> None:
+    """Refuse a map that equals another but for its datum, or has another unit or sign.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        The maps.
+    common : mapping
+        ``xy``, ``theta`` -> places known in all maps.
+    scale : bool
+        Whether magnification belongs to the datum.
+    """
     first = next(index for index, part in enumerate(parts) if part.result is not None)
-    for index, part in enumerate(parts):
-        for values, unit, own in ((maps, "µm", u[first]),
-                                  (lines, "µrad", emaps[first].u_g_theta)):
-            ratio = rms(values[index]) / max(rms(values[first]), rms(own))
-            if part.result is None and ratio > OTHER_UNIT:
-                raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
-                                 f"{parts[first].name}: is it in {unit}?", "give m and rad")
-        for signed, spread in ((maps, u), (lines, [np.sqrt(2) * emap.u_g_theta[1:]
-                                                   for emap in emaps])):
-            if part.result is None and _is_opposite(*(signed[n] / np.maximum(spread[n], NO_SPREAD)
-                                                 for n in (index, first))):
-                raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
-                                 "negative agrees, and it does not",
-                                 "give G = indicated - true")
-        for other in range(index):
-            if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
-                raise InputError(part.name, f"of the same readings as {parts[other].name}: their "
-                                 "maps are equal", "leave one of them out")
+    for kind, known in common.items():
+        q = np.linalg.qr(datum_columns(parts[first].error_map.artifact, kind, known,
+                                       scale=scale))[0]
+        maps, u = (np.array([part.error_map.of(kind)[of][:, known].ravel() for part in parts])
+                   for of in (0, 1))
+        maps -= maps @ q @ q.T
+        for index, part in enumerate(parts):
+            if part.result is None:
+                ratio = rms(maps[index]) / max(rms(maps[first]), rms(u[first]))
+                if ratio > OTHER_UNIT:
+                    raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
+                                     f"{parts[first].name}: is it in µ{KINDS[kind]}?",
+                                     "give m and rad")
+                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_SPREAD) for n in (index, first))):
+                    raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
+                                     "negative agrees, and it does not",
+                                     "give G = indicated - true")
+            for other in range(index if kind == "xy" else 0):
+                if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
+                    raise InputError(part.name, f"of the same readings as {parts[other].name}: "
+                                     "their maps are equal", "leave one of them out")
 
 
 def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
@@ -119,11 +128,9 @@ def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
 
     The ratio of their likelihoods with one sign and the other is exp(2 one . other).
     """
-    known = np.isfinite(one + other)
-    a, b = one[known], other[known]
-    if len(a) < FEWEST or min(rms(a), rms(b)) < SURE:
+    if len(one) < FEWEST or min(rms(one), rms(other)) < SURE:
         return False
-    return bool(a @ b < MIRRORED * np.sqrt((a @ a) * (b @ b)))
+    return bool(one @ other < MIRRORED * len(one) * rms(one) * rms(other))
 
 
 def shared_reference(results: Sequence[CalibrationResult | None],
@@ -284,22 +291,10 @@ def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray,
     return q, np.stack(found, axis=1) if found else np.zeros((len(removed), 0))
 
 
-def _diagonal(covariance: np.ndarray) -> np.ndarray:
-    found = covariance if covariance.ndim == 1 else np.diag(covariance)
-    return np.maximum(found, 0.0)
-
-
-def _power(covariance: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Return the variances of the amplitudes of orthonormal shapes, (m,)."""
-    if covariance.ndim == 1:
-        return (shapes**2).T @ covariance
-    return np.maximum(np.einsum("dm,de,em->m", shapes, covariance, shapes, optimize=True), 0.0)
-
-
 def _independent_number(covariance: np.ndarray) -> float:
     """Return the number of independent values of equal variance with the same scatter of |x|^2."""
     square = float((covariance**2).sum())
-    return float(_diagonal(covariance).sum()) ** 2 / square if square > 0 else 1.0
+    return float(variances(covariance).sum()) ** 2 / square if square > 0 else 1.0
 
 
 def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
@@ -333,39 +328,52 @@ def _scatter(squares: np.ndarray, within: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
-    """Amplitudes of the shapes and the rest of every run, and their variances.
+class _Family:
+    """Values of every run that have one variance between runs: a shape's amplitude, or the rest.
 
-    The rest as that of independent values: `n_rest` of d values are.
+    Attributes
+    ----------
+    values : float array (runs, n)
+        The amplitude, n = 1; or what the shapes leave, as that of independent values.
+    within : float array (runs,)
+        Their variance within each run.
+    share : float array (d,)
+        Variance of each value of the map for a variance of 1.
+    most : int
+        Largest number of independent values.
     """
 
-    shapes: np.ndarray
-    amplitude: np.ndarray
+    values: np.ndarray
     within: np.ndarray
-    rest: np.ndarray
-    rest_within: np.ndarray
-    rest_share: np.ndarray
-    n_rest: int
+    share: np.ndarray
+    most: int
+
+    @cached_property
+    def between(self) -> float:
+        """Variance between runs."""
+        return variance_between(self.values, self.within)
+
+    def number(self, covariance: np.ndarray) -> float:
+        """Return the number of independent values in a map with a covariance."""
+        return min(_independent_number(covariance), self.most)
 
 
-def _parts(values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray,
-           shapes: np.ndarray) -> _Parts:
+def _families(values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray,
+              shapes: np.ndarray) -> list[_Family]:
+    """Return the families of values: one for each shape, and what is left, if anything is."""
     amplitude = values @ shapes
+    within = np.stack([variances_of(c, shapes) for c in covariances])
+    found = [_Family(amplitude[:, [m]], within[:, m], shape**2, 1)
+             for m, shape in enumerate(shapes.T)]
     known = np.concatenate([q, shapes], axis=1)
     n_rest = len(known) - known.shape[1]
-    within = np.stack([_power(c, shapes) for c in covariances])
-    total = np.array([_diagonal(c).sum() for c in covariances])
-    scale = np.sqrt(values.shape[1] / max(n_rest, 1))
-    return _Parts(shapes, amplitude, within, (values - amplitude @ shapes.T) * scale,
-                  np.maximum(total - within.sum(axis=1), 0.0) / max(n_rest, 1),
-                  np.maximum(1 - (known**2).sum(axis=1), 0.0), n_rest)
-
-
-def _variances_between(parts: _Parts) -> tuple[np.ndarray, float]:
-    """Return the variance between runs of each shape's amplitude, and of each value left."""
-    of_shapes = np.array([variance_between(parts.amplitude[:, [m]], parts.within[:, m])
-                          for m in range(parts.shapes.shape[1])])
-    return of_shapes, variance_between(parts.rest, parts.rest_within) if parts.n_rest else 0.0
+    if n_rest:
+        total = np.array([variances(c).sum() for c in covariances])
+        found.append(_Family(
+            (values - amplitude @ shapes.T) * np.sqrt(len(known) / n_rest),
+            np.maximum(total - within.sum(axis=1), 0.0) / n_rest,
+            np.maximum(1 - (known**2).sum(axis=1), 0.0), n_rest))
+    return found
 
 
 def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
@@ -384,26 +392,31 @@ def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
     values = np.stack([run.values - q @ (q.T @ run.values) for run in runs])
     own = [without(run.covariance, q) for run in runs]
     shares = np.array([run.shares for run in runs], dtype=float)
-    parts = _parts(values, own, q, shapes)
-    of_shapes, of_rest = _variances_between(parts)
-    spread = shapes**2 @ of_shapes + parts.rest_share * of_rest
-    weights = 1 / np.maximum([_diagonal(c).sum() + spread.sum() for c in own], TINY)
+    families = _families(values, own, q, shapes)
+    spread = np.sum([family.between * family.share for family in families], axis=0)
+    weights = 1 / np.maximum([variances(c).sum() + spread.sum() for c in own], TINY)
     weights = weights / weights.sum()
     shared = [without(run.common, q) for run in runs if run.shares]
     common = _sum([np.zeros(len(q)), *shared],
                   np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)))
     pooled = weights**2
-    within = sum(w * _diagonal(c) for w, c in zip(pooled, own, strict=True))
+    within = sum(w * variances(c) for w, c in zip(pooled, own, strict=True))
     between = pooled.sum() * spread
     covariance = _sum([*own, common], np.append(pooled, (weights @ shares) ** 2))
-    added = spread if covariance.ndim == 1 else (shapes * of_shapes) @ shapes.T + of_rest * (
-        np.eye(len(q)) - q @ q.T - shapes @ shapes.T)
+    added = spread
+    if covariance.ndim == 2:
+        of_shapes = np.array([family.between for family in families[:shapes.shape[1]]])
+        of_rest = sum(family.between for family in families[shapes.shape[1]:])
+        added = (shapes * of_shapes) @ shapes.T + of_rest * (
+            np.eye(len(q)) - q @ q.T - shapes @ shapes.T)
     covariance = covariance + pooled.sum() * added
-    shared_part = (weights @ shares) ** 2 * _diagonal(common)
-    p = _p_between(parts, runs, own)
-    single = p < RUNS_LEVEL and of_shapes.max(initial=0.0) > SINGLE * spread.sum()
-    dof = _dof_of_single(parts, of_shapes, weights, shared_part) if single else _dof(
-        runs, own, parts, (of_shapes, of_rest), weights, within + shared_part + between)
+    shared_part = (weights @ shares) ** 2 * variances(common)
+    p = _p_between(families, runs, own)
+    of_one = max(families[:shapes.shape[1]], key=lambda family: family.between, default=None)
+    if p < RUNS_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
+        dof = _dof_of_single(of_one, weights, shared_part)
+    else:
+        dof = _dof(runs, own, families, weights, whole=within + shared_part + between)
     return Mean(
         weights @ values, covariance, within, shared_part, between,
         float(np.sqrt(spread.mean())), p, weights, dof,
@@ -418,58 +431,55 @@ def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
                    for f, c in zip(factors, covariances, strict=True)], axis=0)
 
 
-def _p_between(parts: _Parts, runs: list[Run], own: list[np.ndarray]) -> float:
-    """Return the probability of the scatter between runs by chance: the worst shape, Bonferroni."""
-    dof = _noise_dof(runs, own, np.ones(len(runs)))
-    k = len(runs) - 1
-    found = [float(fdtrc(k, dof, _scatter(parts.amplitude[:, [m]], parts.within[:, m]) / k))
-             for m in range(parts.shapes.shape[1])]
-    if parts.n_rest:
-        number = min(_independent_number(_sum(own, np.ones(len(own)))), parts.n_rest)
-        found.append(float(fdtrc(k * number, dof, _scatter(parts.rest, parts.rest_within) / k)))
+def _p_between(families: list[_Family], runs: list[Run], own: list[np.ndarray]) -> float:
+    """Return the probability of the scatter between runs by chance: the worst, Bonferroni."""
+    dof, together = _noise_dof(runs, own, np.ones(len(runs))), _sum(own, np.ones(len(own)))
+    found = []
+    for family in families:
+        k = len(runs) - 1
+        scatter = _scatter(family.values, family.within)
+        found.append(float(fdtrc(k * family.number(together), dof, scatter / k)))
     return min(1.0, len(found) * min(found, default=1.0))
 
 
 def _noise_dof(runs: list[Run], own: list[np.ndarray], factors: np.ndarray) -> float:
     """Return the degrees of freedom of a sum of the runs' covariances (Welch-Satterthwaite)."""
-    power = np.array([f * _diagonal(c).mean() for f, c in zip(factors, own, strict=True)])
-    dof = np.array([min(run.dof, MANY_DOF) if run.dof > 0 else MANY_DOF for run in runs])
-    return min(float(power.sum() ** 2 / max((power**2 / dof).sum(), TINY)), MANY_DOF)
+    power = [float(f * variances(c).mean()) for f, c in zip(factors, own, strict=True)]
+    return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
 
 
-def _dof(runs: list[Run], own: list[np.ndarray], parts: _Parts,
-         between: tuple[np.ndarray, float], weights: np.ndarray, whole: np.ndarray) -> float:
+def _dof(runs: list[Run], own: list[np.ndarray], families: list[_Family], weights: np.ndarray, *,
+         whole: np.ndarray) -> float:
     """Return the degrees of freedom of the mean's u, the median of all values.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
     which contains the part within runs, with one degree of freedom less than there are runs.
     """
-    k, pooled = len(runs) - 1, (weights**2).sum()
-    inner = parts.within.T @ weights**2 / pooled
-    scatter = pooled * (between[0] + inner) * parts.shapes**2
-    terms = (scatter**2).sum(axis=1) / k
-    if parts.n_rest:
-        number = min(_independent_number(_sum(own, weights**2)), parts.n_rest)
-        rest = pooled * (between[1] + weights**2 @ parts.rest_within / pooled) * parts.rest_share
-        terms = terms + rest**2 / (k * number)
+    pooled = _sum(own, weights**2)
+    terms = np.zeros(len(whole))
+    for family in families:
+        k = (len(runs) - 1) * family.number(pooled)
+        terms = terms + _scatter_of_mean(family, weights) ** 2 / k
     for run, c, w in zip(runs, own, weights, strict=True):
         if 0 < run.dof < MANY_DOF:
-            terms = terms + (w**2 * _diagonal(c)) ** 2 / run.dof
+            terms = terms + (w**2 * variances(c)) ** 2 / run.dof
     found = (whole**2 / np.maximum(terms, TINY))[whole > 0]
     return min(float(np.median(found)), MANY_DOF) if len(found) else MANY_DOF
 
 
-def _dof_of_single(parts: _Parts, of_shapes: np.ndarray, weights: np.ndarray,
-                   shared: np.ndarray) -> float:
+def _scatter_of_mean(family: _Family, weights: np.ndarray) -> np.ndarray:
+    """Return the variances (d,) that the scatter of a family between runs gives the mean."""
+    return ((weights**2).sum() * family.between + weights**2 @ family.within) * family.share
+
+
+def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> float:
     """Return the degrees of freedom where runs differ by the amplitude of a single shape.
 
     The value with the fewest: the scatter of the amplitude has as many as there are runs but one,
     and what is shared is known. The noise within runs is not counted as known: the scatter
     contains that of the amplitude, and the rest of it is small there.
     """
-    m = int(np.argmax(of_shapes))
-    scatter = ((weights**2).sum() * of_shapes[m] + weights**2 @ parts.within[:, m]) * (
-        parts.shapes[:, m] ** 2)
+    scatter = _scatter_of_mean(family, weights)
     ratio = float(np.min(shared[scatter > 0] / scatter[scatter > 0]))
     return min((len(weights) - 1) * (1 + ratio) ** 2, MANY_DOF)
 
@@ -486,8 +496,8 @@ def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray
     total = _sum([*own, common], np.append(factors, (shares[i] - others @ shares) ** 2))
     dof = _noise_dof(runs, own, factors)
     full = all(run.covariance.ndim == 2 for run in runs)
-    test = significance(rest, Spread(total if full else _diagonal(total), q, dof))
-    u = np.sqrt(_diagonal(total))
+    test = significance(rest, Spread(total if full else variances(total), q, dof))
+    u = np.sqrt(variances(total))
     e_n = np.divide(rest, coverage_factor(dof) * u, out=np.zeros_like(rest), where=u > 0)
     return Deviation(e_n, test, _p_scatter(i, values, own, others, between))
 
@@ -502,7 +512,7 @@ def _p_scatter(i: int, values: np.ndarray, own: list[np.ndarray], others: np.nda
     runs = len(values)
     if runs < 3:
         return float("nan")
-    power = np.array([_diagonal(c).sum() + _diagonal(between).sum() for c in own])
+    power = np.array([variances(c).sum() + variances(between).sum() for c in own])
     mean = others @ values
     of_mean = others**2 @ power
     left = np.flatnonzero(np.arange(runs) != i)
@@ -517,6 +527,8 @@ def _p_scatter(i: int, values: np.ndarray, own: list[np.ndarray], others: np.nda
 
 BETWEEN = "between_runs"
 """Name of the part between runs among the causes of an enlarged U."""
+SUFFIX = {"xy": "", "theta": "_theta"}
+"""Ends of the names of what is stated of each map."""
 DEGREE = 3
 """Degree up to which each polynomial of a map may vary between runs by its own."""
 HARMONICS = 3
@@ -558,28 +570,24 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
         If the maps cannot be combined.
     """
     first = _checked(parts, keep_scale=keep_scale)
-    known = np.logical_and.reduce([
-        part.error_map.valid & np.isfinite(part.error_map.u_gx + part.error_map.u_gy)
-        for part in parts])
+    common = {kind: np.logical_and.reduce([np.isfinite(part.error_map.of(kind)).all(axis=(0, 1))
+                                           for part in parts]) for kind in KINDS}
+    known, lines = common["xy"], common["theta"]
     if known.sum() < 3:
         raise InputError(parts[-1].name, f"{int(known.sum())} sites are known with their "
                          "uncertainty in all maps", "combine maps that overlap")
-    artifact = first.artifact
-    modes = datum_modes(artifact, scale=not keep_scale)
-    require_own_readings(parts, known, modes)
-    modes = modes[:, :, known]
-    xy = mean_of([_xy_run(part, known, keep_scale=keep_scale) for part in parts],
-                 modes.reshape(len(modes), -1).T, _polynomials(artifact.x_m, artifact.y_m, known))
-    lines = np.logical_and.reduce([np.isfinite(part.error_map.g_theta + part.error_map.u_g_theta)
-                                   for part in parts])
-    theta = None
+    require_own_readings(parts, common, scale=not keep_scale)
+    shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known)}
     if lines.sum() > 1:
-        theta = mean_of([_theta_run(part, lines) for part in parts],
-                        np.ones((int(lines.sum()), 1)), _waves(lines))
-    result = _result(parts, first, (known, xy), (lines, theta))
+        shapes["theta"] = _waves(lines)
+    means = {kind: mean_of(
+        [_run(part, kind, common[kind], keep_scale=keep_scale) for part in parts],
+        datum_columns(first.artifact, kind, common[kind], scale=not keep_scale), of_kind)
+        for kind, of_kind in shapes.items()}
+    result = _result(parts, first, means, common)
     if not keep_scale:
         result = replace(result, reference=None)
-    return Combination(result, known, xy, theta)
+    return Combination(result, known, means["xy"], means.get("theta"))
 
 
 def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
@@ -642,16 +650,16 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
         equal_nan=True))
 
 
-def _xy_run(part: Part, known: np.ndarray, *, keep_scale: bool) -> Run:
-    emap, result = part.error_map, part.result
-    values = np.concatenate([emap.gx[known], emap.gy[known]])
-    u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
+def _run(part: Part, kind: str, known: np.ndarray, *, keep_scale: bool) -> Run:
+    values, u = (of[:, known].ravel() for of in part.error_map.of(kind))
+    result, factors = part.result, np.zeros((0, len(values)))
     if result is None:
         return Run(values, u**2, np.zeros(len(u)), False, np.inf)
-    covariance = xy_covariance(result, known)
-    factors = _common(result, known, keep_scale=keep_scale)
+    covariance = covariance_of(result, kind, known)
+    if kind == "xy":
+        factors = _common(result, known, keep_scale=keep_scale)
     common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
-    return Run(values, covariance - common, common, True, result.noise.dof_of("xy"))
+    return Run(values, covariance - common, common, True, result.noise.dof_of(kind))
 
 
 def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -> np.ndarray:
@@ -671,14 +679,6 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
         place = np.concatenate([at.x_m[known], at.y_m[known]]) * result.reference["u_relative"]
         factors = np.concatenate([factors, place[None]])
     return factors
-
-
-def _theta_run(part: Part, lines: np.ndarray) -> Run:
-    emap, result = part.error_map, part.result
-    values, zero = emap.g_theta[lines], np.zeros(int(lines.sum()))
-    if result is None:
-        return Run(values, emap.u_g_theta[lines] ** 2, zero, False, np.inf)
-    return Run(values, theta_covariance(result, lines), zero, True, result.noise.dof_of("theta"))
 
 
 def _polynomials(x: np.ndarray, y: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -703,67 +703,61 @@ def _waves(lines: np.ndarray) -> np.ndarray:
                      for wave in (np.cos, np.sin)]).T
 
 
-def _result(parts: Sequence[Part], first: CalibrationResult, xy: tuple[np.ndarray, Mean],
-            theta: tuple[np.ndarray, Mean | None]) -> CalibrationResult:
-    (known, mean), (lines, angular), plate = xy, theta, first.plate
-    runs = [part.result for part in parts]
-    n = int(known.sum())
-    gx, gy = (_filled(part, known) for part in (mean.values[:n], mean.values[n:]))
-    u_gx, u_gy = (_filled(part, known) for part in (mean.u[:n], mean.u[n:]))
-    nothing = np.zeros(0)
-    g_theta, u_theta = (_filled(nothing if angular is None else part, lines if angular else
-                                np.zeros_like(lines)) for part in (
-        (nothing, nothing) if angular is None else (angular.values, angular.u)))
+def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str, Mean],
+            common: Mapping[str, np.ndarray]) -> CalibrationResult:
+    """Return the means as a result: of ``xy``, and ``theta`` if it is known, by their places."""
+    plate, known = first.plate, common["xy"]
+    shapes = {"xy": (2, *known.shape), "theta": (1, len(common["theta"]))}
+    maps = {of: np.full(shape, np.nan) for of, shape in shapes.items()}
+    u = {of: np.full(shape, np.nan) for of, shape in shapes.items()}
+    dof, k = dict.fromkeys(KINDS, np.nan), dict.fromkeys(KINDS, 2.0)
+    for kind, mean in means.items():
+        for out, values in ((maps[kind], mean.values), (u[kind], mean.u)):
+            out[:, common[kind]] = values.reshape(len(out), -1)
+        dof[kind], k[kind] = mean.dof, coverage_factor(mean.dof)
+
+    (gx, gy), (u_gx, u_gy) = maps["xy"], u["xy"]
     o, r = first_order(first.artifact, gx + 1j * gy)
-    emap = ErrorMap(first.artifact, gx, gy, u_gx, u_gy, g_theta, u_theta, o, r,
+    emap = ErrorMap(first.artifact, gx, gy, u_gx, u_gy, maps["theta"][0], u["theta"][0], o, r,
                     ThetaDatum.ZERO_MEAN)
-    unknown = np.full(plate.shape, np.nan)
-    dof = [np.nan if found is None else found.dof for found in (mean, angular)]
-    k = [2.0 if found is None else coverage_factor(found.dof) for found in (mean, angular)]
+    unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known.sum())
+    runs = [part.result for part in parts]
     found = CalibrationResult(
-        "+".join(dict.fromkeys(p.result.plan_id for p in parts if p.result)), emap,
+        "+".join(dict.fromkeys(run.plan_id for run in runs if run)), emap,
         ArtifactMap(unknown, unknown, np.full(plate.angular_count, np.nan)), (),
-        Observability(2 * n, 2 * n, 0, True),
-        Noise(np.nan, np.nan, dof_xy=dof[0], dof_theta=dof[1], k_xy=k[0], k_theta=k[1],
-              dof_map_xy=dof[0], dof_map_theta=dof[1]),
+        Observability(unknowns, unknowns, 0, True),
+        Noise(np.nan, np.nan, dof_xy=dof["xy"], dof_theta=dof["theta"], k_xy=k["xy"],
+              k_theta=k["theta"], dof_map_xy=dof["xy"], dof_map_theta=dof["theta"]),
         input={"file": ", ".join(part.name for part in parts)}, method=COMBINED,
-        sense=first.sense, extra=_extra(parts, xy, theta), verdict=_verdict(parts, mean, angular),
+        sense=first.sense, extra=_extra(parts, means), verdict=_verdict(parts, means),
         model=ModelResult(first.model.misalignment),
-        reference=shared_reference(runs, mean.weights),
+        reference=shared_reference(runs, means["xy"].weights),
         provenance=Provenance(version=__version__, extra=exposures(runs)),
         findings=(Finding("not_in_all", details={"sites": int((~known).sum())}),)
         if not known.all() else (),
         placed_plate=first.placed_plate)
-    return replace(found, budget=_budget(found, mean, angular))
+    return replace(found, budget=_budget(found, means))
 
 
-def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    out = np.full(known.shape, np.nan)
-    out[known] = values
-    return out
-
-
-def _extra(parts: Sequence[Part], xy: tuple[np.ndarray, Mean],
-           theta: tuple[np.ndarray, Mean | None]) -> dict[str, Any]:
+def _extra(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
     """Return the runs with their deviations, and the covariance of the mean."""
-    mean, angular = xy[1], theta[1]
-    facts: dict[str, Any] = {"u_between_m": mean.u_between, "p_between": mean.p_between}
-    if angular is not None:
-        facts |= {"u_between_rad": angular.u_between, "p_between_theta": angular.p_between}
-    limit = RUNS_LEVEL / len(parts)
-    facts["runs"] = [{
-        "file": part.name, "run_id": part.result.run_id if part.result else "",
-        "sha256": part.result.input.get("sha256", "") if part.result else "",
-        "weight": float(mean.weights[index]), **_of_run(mean.deviations[index], "", limit),
-        **({} if angular is None else _of_run(angular.deviations[index], "_theta", limit))}
-        for index, part in enumerate(parts)]
-    covers = {}
-    for name, found in (("xy", mean), ("theta", angular)):
-        whole = found is not None and (name == "theta" or all(
-            part.result is not None for part in parts))
-        if found is not None and whole and found.covariance.ndim == 2 and all(
-                test.test is None or test.test.correlated for test in found.deviations):
-            covers[name] = found.covariance
+    facts: dict[str, Any] = {}
+    for kind, mean in means.items():
+        facts |= {f"u_between_{KINDS[kind]}": mean.u_between,
+                  f"p_between{SUFFIX[kind]}": mean.p_between}
+    facts["runs"] = []
+    for index, part in enumerate(parts):
+        run = {"file": part.name, "run_id": part.result.run_id if part.result else "",
+               "sha256": part.result.input.get("sha256", "") if part.result else "",
+               "weight": float(means["xy"].weights[index])}
+        for kind, mean in means.items():
+            run |= _of_run(mean.deviations[index], SUFFIX[kind], RUNS_LEVEL / len(parts))
+        facts["runs"].append(run)
+    own = all(part.result is not None for part in parts)
+    covers = {kind: mean.covariance for kind, mean in means.items()
+              if (own or kind == "theta") and mean.covariance.ndim == 2 and all(
+                  deviation.test is None or deviation.test.correlated
+                  for deviation in mean.deviations)}
     return {COMBINED: facts, **kept_covariance(covers)}
 
 
@@ -776,16 +770,15 @@ def _of_run(found: Deviation, kind: str, limit: float) -> dict[str, Any]:
             f"stands_out{kind}": bool(found.p_scatter < limit)}
 
 
-def _verdict(parts: Sequence[Part], mean: Mean, angular: Mean | None) -> Verdict:
+def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
     """Return the verdict: enlarged if a run's U was, or if the runs differ by more than their U."""
     enlarged: dict[str, Enlargement] = {}
     failed = []
-    for found, kind, unit in ((mean, "xy", "m"), (angular, "theta", "rad")):
-        if found is not None and found.p_between < RUNS_LEVEL:
-            u = np.sqrt(found.between)
-            name = BETWEEN if unit == "m" else f"{BETWEEN}_theta"
+    for kind, mean in means.items():
+        if mean.p_between < RUNS_LEVEL:
+            u, name, unit = np.sqrt(mean.between), BETWEEN + SUFFIX[kind], KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
-            failed.append(Finding("between_runs", found.u_between, unit=unit, p=found.p_between,
+            failed.append(Finding(BETWEEN, mean.u_between, unit=unit, p=mean.p_between,
                                   details={"runs": len(parts), "quantity": kind}))
     for part in parts:
         for item in part.result.verdict.enlarged_by if part.result else ():
@@ -800,20 +793,17 @@ def _verdict(parts: Sequence[Part], mean: Mean, angular: Mean | None) -> Verdict
                    enlarged_by=tuple(enlarged.values()))
 
 
-def _budget(result: CalibrationResult, mean: Mean, angular: Mean | None) -> tuple[BudgetLine, ...]:
+def _budget(result: CalibrationResult, means: Mapping[str, Mean]) -> tuple[BudgetLine, ...]:
     lines: list[BudgetLine] = []
     between = [line for line in budget_lines(result) if line.component == INTERPOLATION]
-    for found, kind, unit in ((mean, "xy", "m"), (angular, "theta", "rad")):
-        if found is None:
-            continue
-        runs = len(found.weights)
+    for kind, mean in means.items():
         for component, variance, size, letter, dof in (
-                ("uncertainty of the runs", found.within, rms(np.sqrt(found.within)), "A",
-                 found.dof),
-                ("shared by all runs", found.common, rms(np.sqrt(found.common)), "B", np.inf),
-                ("between runs", found.between, found.u_between, "A", found.dof)):
+                ("uncertainty of the runs", mean.within, rms(np.sqrt(mean.within)), "A", mean.dof),
+                ("shared by all runs", mean.common, rms(np.sqrt(mean.common)), "B", np.inf),
+                ("between runs", mean.between, mean.u_between, "A", mean.dof)):
             u = np.sqrt(variance)
-            lines.append(BudgetLine(kind, component, letter, 0.0, size, unit, rms(u),
-                                    float(u.max()), dof, "readings", {"runs": runs}))
+            lines.append(BudgetLine(kind, component, letter, 0.0, size, KINDS[kind], rms(u),
+                                    float(u.max()), dof, "readings",
+                                    {"runs": len(mean.weights)}))
         lines += [line for line in between if line.quantity == kind]
     return tuple(lines)

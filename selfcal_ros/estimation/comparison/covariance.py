@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import (
     LinesCovariance,
     MapsCovariance,
@@ -34,16 +33,17 @@ from selfcal_ros.estimation.joint.solve import (
     MAX_FULL,
     OF_OFFSETS,
     factors_of,
+    kept_numbers,
+    not_kept,
     rounded,
 )
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
-from selfcal_ros.estimation.law.solve import law_covariance
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.result import COMBINED, CalibrationResult
+from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations
 
 MAX_LINES = 1024
@@ -51,42 +51,44 @@ MAX_LINES = 1024
 MAX_STORED = 2 * 21 * 21
 """Largest number of coordinates whose covariance is stored: 3.5 MB."""
 COVARIANCE = "map_covariance"
-"""Key of the covariance of a mean map, or of a recheck: lower triangles over Gx, then Gy, of the
-known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta`
-(rad^2)."""
+"""Key of the covariance of a mean map, of a recheck, or of Hu's law: lower triangles over Gx, then
+Gy, of the known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and
+`scale_theta` (rad^2)."""
 
 
-def xy_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of Gx, Gy at the known sites, m^2.
+def covariance_of(result: CalibrationResult, kind: str, known: np.ndarray, *,
+                  plate: bool = False) -> np.ndarray:
+    """Return the covariance of the known values of a map, m^2 or rad^2.
 
-    (2n, 2n), or the variances (2n,) if the correlations are unknown.
+    Parameters
+    ----------
+    result : CalibrationResult
+        The result.
+    kind : str
+        ``xy``: Gx, then Gy; or ``theta``.
+    known : bool array (nx, ny) or (K,)
+        Sites or lines with an error.
+    plate : bool
+        Whether it is the map of the plate.
+
+    Returns
+    -------
+    float array (n, n) or (n,)
+        The covariance; the variances if the correlations are unknown.
     """
-    emap = result.error_map
-    u = np.concatenate([emap.u_gx[known], emap.u_gy[known]])
-    if "xy" in (stored := result.extra.get(COVARIANCE, {})):
-        return _stored(stored, "xy", np.tile(emap.valid, (2, 1)), np.tile(known, (2, 1)))
-    if known.size > MAX_FULL or not np.isfinite(u).all():
+    emap = (plate_as_map(result) if plate else result).error_map
+    u = emap.of(kind)[1][:, known].ravel()
+    if plate:
+        kept = together(result)
+        cover = None if kept is None else kept.of_plate(kind, known)
+        return u**2 if cover is None else cover
+    if kind in result.extra.get(COVARIANCE, {}):
+        return _stored(result, kind, known)
+    found = behind(result)
+    if found is None or not np.isfinite(u).all():
         return u**2
-    if result.method == "law":
-        law, both = law_covariance(result), np.tile(known.ravel(), 2)
-        return u**2 if law is None else _sized(law[0][np.ix_(both, both)], u)
-    system = system_behind(result)
-    if system is None or _lacks_terms(result):
-        return u**2
-    rows = unit_rows(known)
-    if is_flipped(result):
-        rows = rows[:, ::-1, ::-1]
-    maps = maps_behind(result, system)
-    cover = maps.of(rows)
-    if (images := images_behind(result, system)) is not None:
-        cover = cover + share_of(result) * images.added_covariance(maps.sensitivities(rows))
-    factors = factors_of(result)[:, :, known].reshape(-1, 2 * int(known.sum()))
-    return _sized(cover + factors.T @ factors, u)
-
-
-def _lacks_terms(result: CalibrationResult) -> bool:
-    """Return whether the uncertainty has contributions of terms that the result does not keep."""
-    return bool(result.model.terms and KEY not in result.extra)
+    cover = found.of_sites(known) if kind == "xy" else found.of_lines(known)
+    return u**2 if cover is None else _sized(cover, u)
 
 
 def unit_rows(known: np.ndarray) -> np.ndarray:
@@ -96,29 +98,6 @@ def unit_rows(known: np.ndarray) -> np.ndarray:
     rows[np.arange(len(at)), at] = 1.0
     rows[len(at) + np.arange(len(at)), at] = 1j
     return rows.reshape(-1, *known.shape)
-
-
-def theta_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of Gtheta at the known lines, rad^2; variances if not available."""
-    u = result.error_map.u_g_theta[known]
-    if "theta" in (stored := result.extra.get(COVARIANCE, {})):
-        return _stored(stored, "theta", np.isfinite(result.error_map.g_theta), known)
-    if len(known) > MAX_LINES or not np.isfinite(u).all():
-        return u**2
-    if result.method == "law":
-        law = law_covariance(result)
-        return u**2 if law is None else _sized(law[1][np.ix_(known, known)], u)
-    system = system_behind(result)
-    if system is None or not system.angular.n_views:
-        return u**2
-    conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
-                                Sense(result.sense), half_width_m(result))
-    to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
-    cover = lines_alone(system).of(to_datum.T, np.zeros(to_datum.shape))
-    if is_flipped(result):
-        back = -np.arange(len(known)) % len(known)
-        cover = cover[np.ix_(back, back)]
-    return _sized(cover[np.ix_(known, known)], u)
 
 
 def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -138,22 +117,18 @@ def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {COVARIANCE: stored} if stored else {}
 
 
-def _stored(stored: dict[str, Any], kind: str, valid: np.ndarray,
-            known: np.ndarray) -> np.ndarray:
-    """Return the stored covariance of the known values, which are among the valid ones."""
-    n = int(valid.sum())
-    try:
-        values = np.array(stored[kind], dtype=float) * float(stored[f"scale_{kind}"])
-        good = values.shape == (n * (n + 1) // 2,) and bool(np.isfinite(values).all())
-    except (TypeError, ValueError, KeyError):
-        good = False
-    if not good:
-        raise InputError(COVARIANCE, "no covariance of this map",
-                         "write the map again with `selfcal combine`")
+def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarray:
+    """Return the stored covariance of the known values, which are among those of the map."""
+    values = result.error_map.of(kind)[0]
+    there = np.isfinite(values).all(axis=0)
+    n = len(values) * int(there.sum())
+    lower, scale = (kept_numbers(result.extra[COVARIANCE], name, shape, COVARIANCE,
+                                 "no covariance of this map", verb="combine")
+                    for name, shape in ((kind, (n * (n + 1) // 2,)), (f"scale_{kind}", ())))
     full = np.zeros((n, n))
-    full[np.tril_indices(n)] = values
+    full[np.tril_indices(n)] = lower * scale
     full = full + np.tril(full, -1).T
-    chosen = known[valid]
+    chosen = np.tile(known[there], len(values))
     return full[np.ix_(chosen, chosen)]
 
 
@@ -169,55 +144,34 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
-    if COVARIANCE in result.extra or result.method in ("law", COMBINED):
+    unknown = float("nan"), float("nan")
+    if COVARIANCE in result.extra:
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
-        cover = xy_covariance(result, known)
+        cover = covariance_of(result, "xy", known)
         if cover.ndim == 1:
-            return float("nan"), float("nan")
+            return unknown
         z = (result.artifact.x_m + 1j * result.artifact.y_m) / pitch_m
         shear = Gauge(z, known, scale=True).shear[:, known]
         rows = np.concatenate([shear.real, shear.imag], axis=1)
-        u = np.sqrt(np.diag(rows @ cover @ rows.T)) / pitch_m
-        return float(u[0]), float(u[1])
-    system = system_behind(result)
-    if system is None or _lacks_terms(result):
-        return float("nan"), float("nan")
-    variance = np.diag(maps_behind(result, system).of(system.gauge.shear))
-    shear = system.gauge.shear[:, ::-1, ::-1] if is_flipped(result) else system.gauge.shear
-    moved = np.einsum("rij,cij->cr", factors_of(result)[:, 0], shear.real) + np.einsum(
-        "rij,cij->cr", factors_of(result)[:, 1], shear.imag)
-    variance = variance + _added(result)
-    u = np.sqrt((variance + (moved**2).sum(axis=1)) * result.noise.sigma_xy**2)
-    u = u / half_width_m(result)
-    return float(u[0]), float(u[1])
+        variance = np.diag(rows @ cover @ rows.T) / pitch_m**2
+    else:
+        found = behind(result)
+        if found is None or found.lacks_terms:
+            return unknown
+        shear = found.system.gauge.shear
+        moved = np.real(np.tensordot(_complex(factors_of(result)), turned_over(
+            result.sense, shear).conj(), axes=((1, 2), (1, 2))))
+        added = kept_numbers({ADDED: (0.0, 0.0)} | result.extra, ADDED, (2,), ADDED,
+                             "not two variances")
+        variance = np.diag(found.maps.of(shear)) + (moved**2).sum(axis=0) + added
+        variance = variance * (result.noise.sigma_xy / found.half_width_m) ** 2
+    o, r = np.sqrt(variance)
+    return float(o), float(r)
 
 
-def _added(result: CalibrationResult) -> np.ndarray:
-    """Return what noise that is not white adds to the variances of O and R, (2,), unit noise."""
-    found = np.asarray(result.extra.get(ADDED, (0.0, 0.0)))
-    if found.shape != (2,) or found.dtype.kind not in "fi" or not np.isfinite(found).all():
-        raise InputError(ADDED, "not two variances", "write the result again with `selfcal solve`")
-    return found
-
-
-def is_flipped(result: CalibrationResult) -> bool:
-    """Return whether the equations are solved for H(X) = -G(-X)."""
-    return result.sense == Sense.PLATE_MOVES
-
-
-def half_width_m(result: CalibrationResult) -> float:
-    """Return the longer half width of the plate of a result, m."""
-    return result.plate.grid_pitch_m * max(result.plate.reach)
-
-
-def maps_behind(result: CalibrationResult, system: NormalEquations) -> MapsCovariance:
-    """Return the covariance of both maps for unit noise, without terms of the model."""
-    reference = None if result.reference is None else ReferenceLength(**result.reference)
-    noise, length = result.noise, half_width_m(result)
-    ratio = bounded_ratio(system, noise.sigma_xy, noise.sigma_theta,
-                          length) if system.angular.n_views else 1.0
-    return MapsCovariance(system, system.inverse(ratio), reference, half_width_m=length,
-                          sigma_m=noise.sigma_xy)
+def _complex(factors: np.ndarray) -> np.ndarray:
+    """Return factors (r, 2, nx, ny) as complex fields, (r, nx, ny)."""
+    return factors[:, 0] + 1j * factors[:, 1]
 
 
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
@@ -251,23 +205,22 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
 
 def share_of(result: CalibrationResult) -> float:
     """Return the part of the variance of a reading that the marks of an image share; 0 without."""
-    return _kept_number(result, "share", 1.0)
+    return _of_images(result, "share", 1.0)
 
 
 def dof_of_marks(result: CalibrationResult) -> float:
     """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
-    return _kept_number(result, "dof_mark", math.inf)
+    return _of_images(result, "dof_mark", math.inf)
 
 
-def _kept_number(result: CalibrationResult, name: str, most: float) -> float:
-    try:
-        found = float(result.extra.get(IMAGES, {name: 0.0})[name])
-    except (TypeError, ValueError, KeyError, AttributeError):
-        found = math.nan
+def _of_images(result: CalibrationResult, name: str, most: float) -> float:
+    """Return a number from 0 to `most` that a result of images keeps; 0 without images."""
+    wrong = "no noise of images"
+    found = kept_numbers(result.extra.get(IMAGES, {name: 0.0}), name, (), IMAGES, wrong,
+                         finite=False)
     if not 0 <= found <= most:
-        raise InputError(IMAGES, "no noise of images",
-                         "write the result again with `selfcal solve`")
-    return found
+        raise not_kept(IMAGES, wrong)
+    return float(found)
 
 
 def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
@@ -280,26 +233,10 @@ def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
 
 def _kept_cells(result: CalibrationResult, n_views: int) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
-    kept = result.extra[IMAGES]
-    try:
-        seen = [(int(number), (int(m), int(n))) for number, (m, n) in zip(
-            kept["placing"], kept["step"], strict=True)]
-    except (TypeError, ValueError, KeyError, OverflowError):
-        seen = []
-    if len(seen) != n_views or not seen:
-        raise InputError(IMAGES, "no images of these views",
-                         "write the result again with `selfcal solve`")
-    return seen
-
-
-def images_behind(result: CalibrationResult, system: NormalEquations) -> ImageNoise | None:
-    """Return the images behind a result, for `added_covariance` alone; None without images."""
-    if not share_of(result):
-        return None
-    grid = system.grid
-    seen = _kept_cells(result, grid.n_views)
-    return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
-                      np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
+    placings, steps = (kept_numbers(result.extra[IMAGES], name, (n_views, *more), IMAGES,
+                                    "no images of these views").astype(int).tolist()
+                       for name, more in (("placing", ()), ("step", (2,))))
+    return [(number, (m, n)) for number, (m, n) in zip(placings, steps, strict=True)]
 
 
 def _is_read(kept: Any) -> bool:
@@ -318,15 +255,13 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     InputError
         If they are not weights of this field.
     """
-    try:
-        weight = np.array(kept, dtype=float)
-    except (TypeError, ValueError):
-        weight = np.array(np.nan)
-    if weight.ndim == 0:
-        weight = weight * field
-    if weight.shape != field.shape or not (np.isfinite(weight).all() and (weight >= 0).all()):
-        raise InputError(where, "no weights of this field",
-                         "write the result again with `selfcal solve`")
+    wrong = "no weights of this field"
+    if np.ndim(kept) == 0:
+        weight = kept_numbers({where: kept}, where, (), where, wrong) * field
+    else:
+        weight = kept_numbers({where: kept}, where, field.shape, where, wrong)
+    if (weight < 0).any():
+        raise not_kept(where, wrong)
     return weight
 
 
@@ -357,21 +292,76 @@ class Together:
         plate = self.result.artifact_map
         return np.isfinite(plate.ax + plate.ay + plate.u_ax + plate.u_ay)
 
+    @property
+    def lacks_terms(self) -> bool:
+        """Whether the uncertainty has contributions of terms that the result does not keep."""
+        return bool(self.result.model.terms and KEY not in self.result.extra)
+
+    @property
+    def half_width_m(self) -> float:
+        """The longer half width of the plate, m."""
+        plate = self.result.plate
+        return plate.grid_pitch_m * max(plate.reach)
+
     @cached_property
-    def _maps(self) -> MapsCovariance:
-        return maps_behind(self.result, self.system)
+    def maps(self) -> MapsCovariance:
+        """Covariance of both maps for unit noise, without terms of the model."""
+        result, system = self.result, self.system
+        reference = None if result.reference is None else ReferenceLength(**result.reference)
+        noise, length = result.noise, self.half_width_m
+        ratio = bounded_ratio(system, noise.sigma_xy, noise.sigma_theta,
+                              length) if system.angular.n_views else 1.0
+        return MapsCovariance(system, system.inverse(ratio), reference, half_width_m=length,
+                              sigma_m=noise.sigma_xy)
 
     @cached_property
     def _images(self) -> ImageNoise | None:
-        return images_behind(self.result, self.system)
+        """The images, for `added_covariance` alone; None without images."""
+        if not share_of(self.result):
+            return None
+        grid = self.system.grid
+        seen = _kept_cells(self.result, grid.n_views)
+        return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
+                          np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 
-    def _of_noise(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    def stage_rows(self, known: np.ndarray) -> np.ndarray:
+        """Return the functionals Gx, then Gy, at sites, in the frame of the equations."""
+        return turned_over(self.result.sense, unit_rows(known))
+
+    def of_noise(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance of functionals of both maps for noise of marks and images."""
-        cover = self._maps.of(sites, marks)
+        cover = self.maps.of(sites, marks)
         if self._images is None:
             return cover
         return cover + share_of(self.result) * self._images.added_covariance(
-            self._maps.sensitivities(sites, marks))
+            self.maps.sensitivities(sites, marks))
+
+    def of_sites(self, known: np.ndarray) -> np.ndarray | None:
+        """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
+        if known.size > MAX_FULL or self.lacks_terms:
+            return None
+        factors = factors_of(self.result)[:, :, known].reshape(-1, 2 * int(known.sum()))
+        return self.of_noise(self.stage_rows(known)) + factors.T @ factors
+
+    def of_lines(self, known: np.ndarray) -> np.ndarray | None:
+        """Return the covariance of Gtheta at lines for their unit noise, None if it is not kept."""
+        result, system = self.result, self.system
+        if len(known) > MAX_LINES or not system.angular.n_views:
+            return None
+        conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
+                                    Sense(result.sense), self.half_width_m)
+        to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
+        rows = lines_turned_over(result.sense, to_datum)[known]
+        return lines_alone(system).of(rows.T, np.zeros(rows.T.shape))
+
+    def of_plate(self, kind: str, known: np.ndarray) -> np.ndarray | None:
+        """Return the covariance of the plate's map, ``xy`` or ``theta``, None if it is not kept."""
+        if kind == "xy":
+            nowhere = np.zeros(self.sites.shape, dtype=bool)
+            return self.cover(nowhere, known)[:-4, :-4] if self.marks[known].all() else None
+        lines, cover = self.lines()
+        at = len(known) + np.flatnonzero(known)
+        return cover[np.ix_(at, at)] if lines[1][known].all() else None
 
     @cached_property
     def _effects(self) -> np.ndarray:
@@ -388,20 +378,13 @@ class Together:
         of_stage = stage[:, :, sites].reshape(len(stage), here)
         maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
         maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
-        maps[:r, -4:] = self._kept(OF_OFFSETS, (4,)) / half_width_m(self.result)
+        maps[:r, -4:] = self._kept(OF_OFFSETS, (4,)) / self.half_width_m
         return maps
 
     def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the factors of a quantity beside the map, (r, ...)."""
         kept = self.result.extra.get(KEY, {}).get(BESIDE, {name: []})
-        try:
-            found = np.array(kept[name], dtype=float).reshape(-1, *shape)
-        except (TypeError, ValueError, KeyError):
-            found = np.full((1, *shape), np.nan)
-        if not np.isfinite(found).all():
-            raise InputError(KEY, f"no {name} of this plate",
-                             "write the result again with `selfcal solve`")
-        return found
+        return kept_numbers(kept, name, (-1, *shape), KEY, f"no {name} of this plate")
 
     def cover(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the covariance of Gx, Gy at sites, Ax, Ay at marks, and the microscope.
@@ -414,11 +397,9 @@ class Together:
             Of the known ones.
         """
         s, m = 2 * int(sites.sum()), 2 * int(marks.sum())
-        rows_g, rows_a = unit_rows(sites), unit_rows(marks)
-        if is_flipped(self.result):  # G(X) = -H(-X)
-            rows_g = -rows_g[:, ::-1, ::-1]
+        rows_g, rows_a = self.stage_rows(sites), unit_rows(marks)
         exact = np.zeros((s + m + 4, s + m + 4))
-        exact[:-4, :-4] = self._of_noise(
+        exact[:-4, :-4] = self.of_noise(
             np.concatenate([rows_g, np.zeros((m, *rows_g.shape[1:]))]),
             np.concatenate([np.zeros((s, *rows_a.shape[1:])), rows_a]))
         factors = self._factors(sites, marks)
@@ -439,10 +420,7 @@ class Together:
     def _ratio(self) -> float:
         """Variance of the stage's map over that of white noise and terms."""
         emap, known = self.result.error_map, self.sites
-        rows = unit_rows(known)
-        if is_flipped(self.result):
-            rows = rows[:, ::-1, ::-1]
-        white = np.trace(self._of_noise(rows, np.zeros((len(rows), *self.marks.shape))))
+        white = np.trace(self.of_noise(self.stage_rows(known)))
         factors = factors_of(self.result)[..., known]
         white += (factors**2).sum()
         effects = (self._effects[..., known] ** 2).sum()
@@ -455,7 +433,7 @@ class Together:
         """The same for the plate's map, on which noise of images acts differently."""
         plate, known = self.result.artifact_map, self.marks
         rows = unit_rows(known)
-        white = np.trace(self._of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
+        white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
         white += (self._kept("plate", (2, *known.shape))[..., known] ** 2).sum()
         found = (plate.u_ax[known] ** 2 + plate.u_ay[known] ** 2).sum()
         return float(found / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
@@ -475,18 +453,21 @@ class Together:
         for part, here in enumerate(known):
             at = part * count + np.flatnonzero(here)
             centre[np.ix_(at, at)] = np.eye(len(at)) - 1 / len(at)
-        stage = centre[:, :count]
-        if is_flipped(result):
-            stage = -stage[:, -np.arange(count) % count]
-        noise = result.noise
-        cover = LinesCovariance(self._maps, (noise.sigma_xy, noise.sigma_theta)).of(
-            stage.T, centre[:, count:].T)
+        stage, noise = lines_turned_over(result.sense, centre[:, :count].T), result.noise
+        cover = LinesCovariance(self.maps, (noise.sigma_xy, noise.sigma_theta)).of(
+            stage, centre[:, count:].T)
         terms = self._kept("lines", (2 * count,)) @ centre.T * (
-            noise.sigma_xy / half_width_m(result))
+            noise.sigma_xy / self.half_width_m)
         cover = cover + terms.T @ terms
         white = np.diag(cover)[:count][known[0]].sum()
         found = (emap.u_g_theta[known[0]] ** 2).sum()
         return known, cover * max(float(found / white), 1.0)
+
+
+def behind(result: CalibrationResult) -> Together | None:
+    """Return the covariances behind a result; None if its readings are not kept."""
+    system = system_behind(result)
+    return None if system is None else Together(result, system)
 
 
 def together(result: CalibrationResult) -> Together | None:
@@ -495,31 +476,8 @@ def together(result: CalibrationResult) -> Together | None:
             result.model.terms and BESIDE not in result.extra.get(KEY, {})) \
             or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
         return None
-    system = system_behind(result)
-    found = None if system is None else Together(result, system)
+    found = behind(result)
     return found if found is not None and found.marks.any() else None
-
-
-def plate_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of Ax, Ay at marks, m^2.
-
-    (2n, 2n), or the variances (2n,) if the correlations are not kept.
-    """
-    emap, kept = plate_as_map(result).error_map, together(result)
-    if kept is None or not kept.marks[known].all():
-        return np.concatenate([emap.u_gx[known], emap.u_gy[known]]) ** 2
-    nowhere = np.zeros(kept.sites.shape, dtype=bool)
-    return kept.cover(nowhere, known)[:-4, :-4]
-
-
-def plate_theta_covariance(result: CalibrationResult, known: np.ndarray) -> np.ndarray:
-    """Return the covariance of Atheta at lines, rad^2; variances if it is not kept."""
-    u, kept = plate_as_map(result).error_map.u_g_theta, together(result)
-    lines, cover = (np.zeros((2, 0)), u) if kept is None else kept.lines()
-    if not lines.size or not lines[1][known].all():
-        return u[known] ** 2
-    at = len(u) + np.flatnonzero(known)
-    return cover[np.ix_(at, at)]
 
 
 def plate_as_map(result: CalibrationResult) -> CalibrationResult:

@@ -10,19 +10,19 @@ from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import (
+    covariance_of,
     first_order_u,
     plate_as_map,
-    plate_covariance,
-    plate_theta_covariance,
-    theta_covariance,
-    xy_covariance,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
+from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, datum_columns, rms
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import MM_PER_M
+
+KINDS = {"xy": "m", "theta": "rad"}
+"""The maps of a result, and their units."""
 
 DIFFERENCE_LEVEL = 0.05
 """Probability that maps of the same stage differ significantly, both tests together."""
@@ -73,7 +73,7 @@ class Spread:
     @cached_property
     def variance(self) -> np.ndarray:
         """Variance of each value without the columns, (n,)."""
-        return np.diag(self.remaining) if self.correlated else self.remaining
+        return variances(self.remaining)
 
     @property
     def varies(self) -> np.ndarray:
@@ -123,10 +123,22 @@ class Spread:
         return ratio / np.sqrt(rng.chisquare(self.dof, DRAWS) / self.dof)
 
 
+def variances(covariance: np.ndarray) -> np.ndarray:
+    """Return the variances (n,) of a covariance, or the variances that stand for it."""
+    return np.maximum(np.diag(covariance) if covariance.ndim == 2 else covariance, 0.0)
+
+
+def variances_of(covariance: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the variances of the inner products of values (n,) with columns (n, k), (k,)."""
+    square = covariance @ columns**2 if covariance.ndim == 1 else np.einsum(
+        "nk,nk->k", covariance @ columns, columns)
+    return np.maximum(square, 0.0)
+
+
 def of_one_kind(covers: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return covariances, or all as variances if one of them is not a full matrix."""
     full = all(cover.ndim == 2 for cover in covers)
-    return [cover if full or cover.ndim == 1 else np.diag(cover) for cover in covers]
+    return list(covers) if full else [variances(cover) for cover in covers]
 
 
 def significance(values: np.ndarray, spread: Spread) -> Significance | None:
@@ -144,7 +156,7 @@ def significance(values: np.ndarray, spread: Spread) -> Significance | None:
     return Significance(square / rank, float(rank), p, spread.correlated, largest, limit, p_z, dof,
                         min(p, p_z) < DIFFERENCE_LEVEL / 2,
                         u_rms=float(np.sqrt(spread.variance.mean())),
-                        u_largest=float(np.sqrt(max(of_largest, 0.0))))
+                        u_largest=float(np.sqrt(of_largest)))
 
 
 def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -255,32 +267,56 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     InputError
         If the lattices differ or no site is known in both.
     """
-    results, covariance, of_theta = (a, b), xy_covariance, theta_covariance
-    if plates:
-        a, b = plate_as_map(a), plate_as_map(b)
-        covariance, of_theta = plate_covariance, plate_theta_covariance
-    require_same_lattice(a.artifact, b.artifact, names)
-    artifact = a.artifact
-    difference = np.stack([b.error_map.gx - a.error_map.gx, b.error_map.gy - a.error_map.gy])
-    known = np.isfinite(difference).all(axis=0)
-    if known.sum() < 3:
-        raise InputError(names[1], f"{int(known.sum())} sites are known in both maps",
+    covariance = partial(covariance_of, plate=plates)
+    pair = [(plate_as_map(result) if plates else result).error_map for result in (a, b)]
+    require_same_lattice(pair[0].artifact, pair[1].artifact, names)
+    known = int((pair[0].valid & pair[1].valid).sum())
+    if known < 3:
+        raise InputError(names[1], f"{known} sites are known in both maps",
                          "compare maps that overlap")
-    modes = datum_modes(artifact, scale=not keep_scale)
-    basis = modes[:, :, known].reshape(len(modes), -1).T
-    parts = np.linalg.lstsq(basis / np.linalg.norm(basis, axis=0), difference[:, known].ravel(),
-                            rcond=None)[0] / np.linalg.norm(basis, axis=0)
-    rest = difference - np.tensordot(parts, modes, axes=1)
-    d_theta = b.error_map.g_theta - a.error_map.g_theta
-    constant = float(np.nanmean(d_theta)) if np.isfinite(d_theta).any() else float("nan")
-    total = np.sum(of_one_kind([covariance(result, known) for result in results]), axis=0)
-    xy = significance(rest[:, known].ravel(), Spread(total, basis, _noise_dof(a, b, "xy")))
+
+    xy, theta = (_difference((a, b), pair, kind, covariance, scale=not keep_scale)
+                 for kind in KINDS)
+    o, r = (getattr(pair[1], name) - getattr(pair[0], name)
+            for name in ("nonorthogonality", "scale_difference"))
+    dx, dy = xy.values
     return MapDifference(
-        rest[0], rest[1], d_theta - constant, (float(parts[0]), float(parts[1])), float(parts[2]),
-        0.0 if keep_scale else float(parts[3]), constant,
-        b.error_map.nonorthogonality - a.error_map.nonorthogonality,
-        b.error_map.scale_difference - a.error_map.scale_difference, xy,
-        _theta_test(a, b, d_theta, [partial(of_theta, r) for r in results]))
+        dx, dy, theta.values[0], (float(xy.datum[0]), float(xy.datum[1])), float(xy.datum[2]),
+        0.0 if keep_scale else float(xy.datum[3]), float(theta.datum[0]), o, r, xy.test,
+        theta.test)
+
+
+@dataclass(frozen=True, eq=False)
+class _Difference:
+    """One map minus another, (parts, *places), the datum difference removed, and its test."""
+
+    values: np.ndarray
+    datum: np.ndarray
+    test: Significance | None
+
+
+def _difference(results: Sequence[CalibrationResult], maps: Sequence[ErrorMap], kind: str,
+                covariance: Callable[..., np.ndarray], *, scale: bool) -> _Difference:
+    """Return the second map minus the first."""
+    (old, _), (new, _) = (emap.of(kind) for emap in maps)
+    known = np.isfinite(new - old).all(axis=0)
+    columns = datum_columns(maps[0].artifact, kind, known, scale=scale)
+    out = np.full(old.shape, np.nan)
+    if not known.any():
+        return _Difference(out, np.full(columns.shape[1], np.nan), None)
+
+    values, size = (new - old)[:, known].ravel(), np.linalg.norm(columns, axis=0)
+    datum = np.linalg.lstsq(columns / size, values, rcond=None)[0] / size
+    values = values - columns @ datum
+    out[:, known] = values.reshape(len(out), -1)
+    if known.sum() < 2:
+        return _Difference(out, datum, None)
+
+    total = np.sum(of_one_kind([covariance(result, kind, known) for result in results]), axis=0)
+    power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
+    dof = joint_dof(*zip(power, [getattr(result.noise, f"dof_{kind}") for result in results],
+                         strict=True))
+    return _Difference(out, datum, significance(values, Spread(total, columns, dof)))
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
@@ -299,37 +335,14 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
                          "compare maps of the same plate")
 
 
-def _theta_test(a: CalibrationResult, b: CalibrationResult, d_theta: np.ndarray,
-                covariances: Sequence[Callable[[np.ndarray], np.ndarray]]) -> Significance | None:
-    known = np.isfinite(d_theta)
-    if known.sum() < 2:
-        return None
-    values = d_theta[known] - d_theta[known].mean()
-    total = np.sum(of_one_kind([covariance(known) for covariance in covariances]), axis=0)
-    constant = np.ones((len(values), 1))
-    return significance(values, Spread(total, constant, _noise_dof(a, b, "theta")))
-
-
-def _noise_dof(a: CalibrationResult, b: CalibrationResult, kind: str) -> float:
-    """Return the effective degrees of freedom of the noise behind both uncertainties."""
-    parts = []
-    for result in (a, b):
-        emap = result.error_map
-        u = emap.u_g_theta if kind == "theta" else np.stack([emap.u_gx, emap.u_gy])
-        known = u[np.isfinite(u)]
-        parts.append((float(np.mean(known**2)) if len(known) else 0.0,
-                      getattr(result.noise, f"dof_{kind}")))
-    return joint_dof(*parts)
-
-
 def joint_dof(*parts: tuple[float, float]) -> float:
     """Return the degrees of freedom of a sum of variances (Welch-Satterthwaite).
 
     A variance without degrees of freedom, one of declared noise, counts as known.
     """
-    total = sum(variance for variance, _ in parts) ** 2
-    return float(total / max(sum(variance**2 / (dof if dof > 0 else np.inf)
-                                 for variance, dof in parts), np.finfo(float).tiny))
+    whole = sum(variance for variance, _ in parts)
+    of_parts = sum(variance**2 / (dof if dof > 0 else np.inf) for variance, dof in parts)
+    return float(whole) ** 2 / max(float(of_parts), float(np.finfo(float).tiny))
 
 
 @dataclass(frozen=True)

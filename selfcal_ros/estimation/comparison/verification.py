@@ -13,21 +13,27 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.comparison.maps import (
     Spread,
     joint_dof,
     of_one_kind,
     require_same_lattice,
     significance,
+    variances,
+    variances_of,
     without,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.model.error_map import datum_modes, rms
+from selfcal_ros.model.error_map import ErrorMap, datum_columns, rms
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
+
+AXES = {"xy": ("x", "y"), "theta": ("theta",)}
+"""Axes of each map."""
 
 REMAINS_LEVEL = 0.0005
 """Probability of a test below which an error remains: a verdict on wiring, not on drift."""
@@ -135,22 +141,66 @@ class Verification:
 
 @dataclass(frozen=True, eq=False)
 class _Maps:
-    """Errors before and after (n,), their covariances, (n, n) or (n,), and the datum's columns."""
+    """Errors before and after, without their datum, in the axes x and y, or of the angle.
 
+    Attributes
+    ----------
+    kind : str
+        ``xy`` or ``theta``.
+    known : bool array (nx, ny) or (K,)
+        Their places.
+    before, after : float array (n,)
+        The errors, one axis after the other.
+    cover_before, cover_after : float array (n, n) or (n,)
+        Their covariances, or variances.
+    datum : float array (n, k)
+        The datum's columns, orthonormal.
+    dof : float
+        Degrees of freedom of the sum of both covariances.
+    """
+
+    kind: str
+    known: np.ndarray
     before: np.ndarray
     after: np.ndarray
     cover_before: np.ndarray
     cover_after: np.ndarray
     datum: np.ndarray
+    dof: float
 
     @property
     def cover(self) -> np.ndarray:
         """Covariance of the correction that acts."""
         return self.cover_before + self.cover_after
 
+    @property
+    def action(self) -> np.ndarray:
+        """The correction that acts, without its part in the datum, (n,)."""
+        return self.free(self.before - self.after)
+
     def free(self, values: np.ndarray) -> np.ndarray:
         """Return values (n, ...) without their part in the datum."""
         return values - self.datum @ (self.datum.T @ values)
+
+    def by_axis(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n,) by their axis, (axes, places)."""
+        return values.reshape(len(AXES[self.kind]), -1)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """The error before as a column of each axis, (n, axes)."""
+        return self.free(_columns(self.by_axis(self.before)))
+
+    @property
+    def remaining(self) -> Significance | None:
+        """Test of the error with the correction on, with the covariance of both maps."""
+        return significance(self.after, Spread(self.cover, self.datum, self.dof))
+
+    @property
+    def too_small(self) -> bool:
+        """Whether the error before is not larger than its noise."""
+        power = _square(self.before) - variances(self.cover_before).sum()
+        return power <= 2 * (2 * _square(self.cover_before)) ** 0.5
 
 
 def require_correctable(result: CalibrationResult, where: str) -> None:
@@ -200,86 +250,70 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
     if known.sum() < 3:
         raise InputError(names[1], f"{int(known.sum())} nodes are known in both maps",
                          "measure where the map is known")
-    maps = _xy_maps(before, after, known)
+    maps = _maps(before, after, "xy", known)
     if not np.isfinite(maps.cover).all():
         raise InputError(names[0] if np.isfinite(second.u_gx[known]).all() else names[1],
                          "has no uncertainty, so nothing can be verified",
                          "solve it again with --uncertainty always")
-    remaining = _remaining(maps, before.noise.dof_xy, after.noise.dof_xy)
+    remaining = maps.remaining
     remains = _is_clear(remaining)
-    action = maps.free(maps.before - maps.after)
-    size = float(np.linalg.norm(action) * np.linalg.norm(maps.before))
-    alike = float(action @ maps.before) / size if size else 0.0
+    size = float(np.linalg.norm(maps.action) * np.linalg.norm(maps.before))
+    alike = float(maps.action @ maps.before) / size if size else 0.0
     gain, u_gain = _gain(maps)
     factors = _straight_factors(maps)
-    fault = _fault(maps, (first.gx, first.gy), known, factors)
+    fault = _fault(maps, first, factors)
     if not remains and gain > 2 * u_gain:
         fault = Fault.NONE
     elif fault is Fault.OTHER and (gain > 2 * u_gain or alike > ALIKE):
         fault = Fault.OLDER
-    spread = np.full((2, *known.shape), np.nan)
-    spread[:, known] = maps.after.reshape(2, -1)
-    axes = {name: AxisError(
-        *_sizes(maps.before, maps.after, part),
-        before.noise.k_xy * rms(getattr(first, f"u_g{name}")[known]),
-        after.noise.k_xy * rms(getattr(second, f"u_g{name}")[known]), *factors[index])
-        for index, (name, part) in enumerate(zip("xy", np.split(
-            np.arange(len(maps.before)), 2), strict=True))}
+    axes = _axes(maps, (before, after), factors)
+
     theta_fault, worse = Fault.NONE, False
     lines = np.isfinite(first.g_theta + second.g_theta)
     g_theta = np.full(lines.shape, np.nan)
     if lines.sum() > 2:
-        circle = _theta_maps(before, after, lines)
+        circle = _maps(before, after, "theta", lines)
         theta_gain, u_theta_gain = _gain(circle)
         worse = theta_gain < -2 * u_theta_gain
-        theta_fault, factor = _theta_fault(circle)
-        if not _is_clear(_remaining(circle, before.noise.dof_theta, after.noise.dof_theta)):
-            theta_fault = Fault.NONE
+        factors = _straight_factors(circle)
+        if _is_clear(circle.remaining):
+            theta_fault = _theta_fault(circle, factors)
         g_theta[lines] = circle.after
-        axes["theta"] = AxisError(
-            *_sizes(circle.before, circle.after, np.arange(int(lines.sum()))),
-            before.noise.k_theta * rms(first.u_g_theta[lines]),
-            after.noise.k_theta * rms(second.u_g_theta[lines]), *factor)
+        axes |= _axes(circle, (before, after), factors)
+    gx, gy = np.full((2, *known.shape), np.nan)
+    gx[known], gy[known] = maps.by_axis(maps.after)
     return Verification(gain > 2 * u_gain and not worse, fault, theta_fault, remains, axes, alike,
-                        remaining, spread[0], spread[1], g_theta)
+                        remaining, gx, gy, g_theta)
 
 
-def _xy_maps(before: CalibrationResult, after: CalibrationResult, known: np.ndarray) -> _Maps:
-    """Return both maps of x and y over the known nodes; scale is datum unless both have one."""
-    keep_scale = before.reference is not None and after.reference is not None
-    modes = datum_modes(before.artifact, scale=not keep_scale)
-    basis = modes[:, :, known].reshape(len(modes), -1).T
-    q = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))[0]
-    values, covers = [], []
-    for result in (before, after):
-        emap = result.error_map
-        here = np.concatenate([emap.gx[known], emap.gy[known]])
-        values.append(here - q @ (q.T @ here))
-        covers.append(xy_covariance(result, known))
-    return _Maps(values[0], values[1], *_without_datum(covers, q), q)
+def _maps(before: CalibrationResult, after: CalibrationResult, kind: str,
+          known: np.ndarray) -> _Maps:
+    """Return both maps over known places; scale is datum unless both have one."""
+    pair = (before, after)
+    keep_scale = all(result.reference is not None for result in pair)
+    columns = datum_columns(before.artifact, kind, known, scale=not keep_scale)
+    datum = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+    values = [result.error_map.of(kind)[0][:, known].ravel() for result in pair]
+    covers = [without(cover, datum) for cover in of_one_kind(
+        [covariance_of(result, kind, known) for result in pair])]
+    dof = joint_dof(*((float(variances(cover).sum()), getattr(result.noise, f"dof_{kind}"))
+                      for cover, result in zip(covers, pair, strict=True)))
+    free = [each - datum @ (datum.T @ each) for each in values]
+    return _Maps(kind, known, free[0], free[1], covers[0], covers[1], datum, dof)
 
 
-def _theta_maps(before: CalibrationResult, after: CalibrationResult, known: np.ndarray) -> _Maps:
-    """Return both angular maps over the known lines."""
-    q = np.full((int(known.sum()), 1), known.sum() ** -0.5)
-    values = [result.error_map.g_theta[known] for result in (before, after)]
-    covers = [theta_covariance(result, known) for result in (before, after)]
-    one, other = (each - each.mean() for each in values)
-    return _Maps(one, other, *_without_datum(covers, q), q)
-
-
-def _without_datum(covers: list[np.ndarray],
-                 q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two covariances without the datum's part, as matrices, or both as variances."""
-    one, other = (without(cover, q) for cover in of_one_kind(covers))
-    return one, other
-
-
-def _remaining(maps: _Maps, *dof: float) -> Significance | None:
-    """Return the test of the error with the correction on, with the covariance of both maps."""
-    sizes = (_trace(maps.cover_before), _trace(maps.cover_after))
-    return significance(maps.after, Spread(maps.cover, maps.datum,
-                                           joint_dof(*zip(sizes, dof, strict=True))))
+def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult],
+          factors: list[tuple[float, float]]) -> dict[str, AxisError]:
+    """Return the errors of each axis before and after, with U and the factor."""
+    u_before, u_after = (
+        getattr(result.noise, f"k_{maps.kind}") * result.error_map.of(maps.kind)[1]
+        for result in pair)
+    before, after = maps.by_axis(maps.before), maps.by_axis(maps.after)
+    return {name: AxisError(
+        rms(before[axis]), rms(after[axis]), float(np.abs(before[axis]).max()),
+        float(np.abs(after[axis]).max()), rms(u_before[axis, maps.known]),
+        rms(u_after[axis, maps.known]), *factors[axis])
+        for axis, name in enumerate(AXES[maps.kind])}
 
 
 def _is_clear(test: Significance | None) -> bool:
@@ -287,13 +321,8 @@ def _is_clear(test: Significance | None) -> bool:
     return test is not None and min(test.p, test.p_z) < REMAINS_LEVEL
 
 
-def _trace(cover: np.ndarray) -> float:
-    return float(np.trace(cover) if cover.ndim == 2 else cover.sum())
-
-
-def _square_of(cover: np.ndarray, values: np.ndarray) -> float:
-    """Return the variance of a linear function of the values."""
-    return float(values @ cover @ values if cover.ndim == 2 else values**2 @ cover)
+def _square(values: np.ndarray) -> float:
+    return float((values**2).sum())
 
 
 def _gain(maps: _Maps) -> tuple[float, float]:
@@ -301,75 +330,54 @@ def _gain(maps: _Maps) -> tuple[float, float]:
     gain, variance = 0.0, 0.0
     for sign, values, cover in ((1, maps.before, maps.cover_before),
                                 (-1, maps.after, maps.cover_after)):
-        gain += sign * (float(values @ values) - _trace(cover))
-        variance += 4 * _square_of(cover, values) + 2 * float((cover**2).sum())
+        gain += sign * (_square(values) - float(variances(cover).sum()))
+        variance += 4 * float(variances_of(cover, values[:, None])[0]) + 2 * _square(cover)
     return gain, variance ** 0.5
 
 
-def _sizes(before: np.ndarray, after: np.ndarray,
-           part: np.ndarray) -> tuple[float, float, float, float]:
-    """Return rms before and after, largest before and after, of a part."""
-    return (rms(before[part]), rms(after[part]), float(np.abs(before[part]).max()),
-            float(np.abs(after[part]).max()))
+def _columns(field: np.ndarray) -> np.ndarray:
+    """Return a field (axes, places) as a column for each axis, (values, axes)."""
+    return block_diag(*field[:, :, None])
 
 
 def _straight_factors(maps: _Maps) -> list[tuple[float, float]]:
-    """Return the factors of the correction in x and y, and their u; NaN where not shown.
+    """Return the factors of the correction in each axis, and their u; NaN where not shown.
 
     What the map has of noise is in the correction as well: that part of the sum of products is
     taken off.
     """
-    n = len(maps.before) // 2
-    variances = np.diag(maps.cover_before) if maps.cover_before.ndim == 2 else maps.cover_before
-    noise = [float(variances[:n].sum()), float(variances[n:].sum())]
-    return _factors(maps, maps.free(_columns(maps.before.reshape(2, n))), noise)
-
-
-def _columns(field: np.ndarray) -> np.ndarray:
-    """Return a field (2, n) as one column for x and one for y, (2 n, 2)."""
-    zero = np.zeros(field.shape[1])
-    return np.stack([np.concatenate([field[0], zero]), np.concatenate([zero, field[1]])], axis=1)
-
-
-def _factors(maps: _Maps, columns: np.ndarray,
-             noise: list[float]) -> list[tuple[float, float]]:
-    """Return the factors of columns (n, c) in the correction that acts, and their u."""
-    action = maps.free(maps.before - maps.after)
+    columns, noise = maps.columns, maps.by_axis(variances(maps.cover_before)).sum(axis=1)
     products = columns.T @ columns
     if np.linalg.matrix_rank(products) < len(products):
         return [(float("nan"), float("nan"))] * len(products)
-    weights = np.linalg.solve(products, columns.T)
-    values = np.linalg.solve(products, columns.T @ action - np.array(noise))
-    u = [_square_of(maps.cover, row) ** 0.5 for row in weights]
-    return [(float(value), float(one)) for value, one in zip(values, u, strict=True)]
+    weights = np.linalg.solve(products, columns.T).T
+    values = np.linalg.solve(products, columns.T @ maps.action - noise)
+    u = np.sqrt(variances_of(maps.cover, weights))
+    return list(zip(values.tolist(), u.tolist(), strict=True))
 
 
 def _unexplained(maps: _Maps, explained: np.ndarray) -> float:
     """Return the part of the squares that is unexplained, noise taken off."""
-    action = maps.free(maps.before - maps.after)
-    rest = action - explained
-    size = max(float(action @ action), float(maps.before @ maps.before))
-    return max(float(rest @ rest) - _trace(maps.cover), 0.0) / size if size else 0.0
+    size = max(_square(maps.action), _square(maps.before))
+    left = _square(maps.action - explained) - float(variances(maps.cover).sum())
+    return max(left, 0.0) / size if size else 0.0
 
 
-def _fault(maps: _Maps, fields: tuple[np.ndarray, np.ndarray], known: np.ndarray,
-           factors: list[tuple[float, float]]) -> Fault:
+def _fault(maps: _Maps, emap: ErrorMap, factors: list[tuple[float, float]]) -> Fault:
     """Return what acts on x and y instead of the map."""
-    cover, before = maps.cover_before, maps.before
-    if float(before @ before) - _trace(cover) <= 2 * (2 * float((cover**2).sum())) ** 0.5:
+    if maps.too_small:
         return Fault.TOO_SMALL
-    columns = maps.free(_columns(before.reshape(2, -1)))
-    itself = _unexplained(maps, columns @ np.nan_to_num([value for value, _ in factors]))
+    itself = _unexplained(maps, maps.columns @ np.nan_to_num([value for value, _ in factors]))
     others = {}
-    for fault, field_of in _arranged(*fields).items():
-        if np.isfinite(np.stack(field_of)[:, known]).all():
-            moved = maps.free(_columns(np.stack(field_of)[:, known]))
-            weights = np.linalg.lstsq(moved, maps.free(maps.before - maps.after), rcond=None)[0]
+    for fault, field_of in _arranged(emap.gx, emap.gy).items():
+        here = np.stack(field_of)[:, maps.known]
+        if np.isfinite(here).all():
+            moved = maps.free(_columns(here))
+            weights = np.linalg.lstsq(moved, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
                 others[fault] = _unexplained(maps, moved @ weights)
     likely = min(others, key=lambda name: others[name], default=Fault.OTHER)
-    least = others.get(likely, np.inf)
-    if least < min(EXPLAINED, CLEARLY_LESS * itself):
+    if others.get(likely, np.inf) < min(EXPLAINED, CLEARLY_LESS * itself):
         return likely
     return _of_factors(factors) if itself < EXPLAINED else Fault.OTHER
 
@@ -410,12 +418,10 @@ def _of_factors(factors: list[tuple[float, float]]) -> Fault:
     return Fault.OLDER if abs(values - 1).max() < CHANGED else Fault.AXES_DIFFER
 
 
-def _theta_fault(maps: _Maps) -> tuple[Fault, tuple[float, float]]:
-    """Return what acts on the angle, and its factor with u; NONE if too little is to be seen."""
-    cover, before = maps.cover_before, maps.before
-    factor, = _factors(maps, before[:, None], [_trace(cover)])
-    if float(before @ before) - _trace(cover) <= 2 * (2 * float((cover**2).sum())) ** 0.5:
-        return Fault.NONE, factor
-    if _unexplained(maps, before * factor[0]) >= EXPLAINED:
-        return Fault.OTHER, factor
-    return _kind(*factor) or Fault.NONE, factor
+def _theta_fault(maps: _Maps, factors: list[tuple[float, float]]) -> Fault:
+    """Return what acts on the angle; NONE if too little is to be seen."""
+    if maps.too_small:
+        return Fault.NONE
+    if _unexplained(maps, maps.before * factors[0][0]) >= EXPLAINED:
+        return Fault.OTHER
+    return _kind(*factors[0]) or Fault.NONE

@@ -292,16 +292,48 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
     shape = (2, *result.artifact.shape)
     if KEY not in result.extra:
         return np.zeros((0, *shape))
-    try:
-        kept = result.extra[KEY]
-        factors = np.array(kept["factors"], dtype=float).reshape(-1, *shape)
-        good = np.isfinite(factors).all() and len(factors) == len(kept["terms"])
-    except (TypeError, ValueError, KeyError):
-        good = False
-    if not good:
-        raise InputError(KEY, "no factors of this lattice",
-                         "write the result again with `selfcal solve`")
+    wrong = "no factors of this lattice"
+    factors = kept_numbers(result.extra[KEY], "factors", (-1, *shape), KEY, wrong)
+    if len(factors) != len(result.extra[KEY].get("terms", ())):
+        raise not_kept(KEY, wrong)
     return factors
+
+
+def kept_numbers(kept: Any, name: str, shape: tuple[int, ...], where: str, wrong: str, *,
+                 verb: str = "solve", finite: bool = True) -> np.ndarray:
+    """Return numbers that a result keeps under a name.
+
+    Parameters
+    ----------
+    kept : dict
+        What it keeps.
+    name : str
+        Which.
+    shape : tuple of int
+        Their shape; -1 where any number of them may be.
+    where, wrong, verb : str
+        Place, fault and the verb that writes it anew, for the message.
+    finite : bool
+        Whether none may be infinite.
+
+    Raises
+    ------
+    InputError
+        If they are not such numbers.
+    """
+    try:
+        found = np.array(kept[name], dtype=float).reshape(shape)
+    except (TypeError, ValueError, KeyError):
+        found = np.array(np.nan)
+    if not (np.isfinite(found) if finite else ~np.isnan(found)).all():
+        raise not_kept(where, wrong, verb)
+    return found
+
+
+def not_kept(where: str, wrong: str, verb: str = "solve") -> InputError:
+    """Return the error of a result that does not keep what it should."""
+    return InputError(where, wrong, f"write the {'map' if verb == 'combine' else 'result'} again "
+                      f"with `selfcal {verb}`")
 
 
 def angular_terms(cover: MapsCovariance, columns: TermColumns, sigma_m: float,

@@ -15,13 +15,20 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.covariance import kept_covariance
 from selfcal_ros.estimation.joint.problem import FLOOR, NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.solve import Solved, noise_of
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, half_axis_slopes
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import (
+    Measurements,
+    Sense,
+    ViewReadings,
+    lines_turned_over,
+    turned_over,
+)
 from selfcal_ros.model.result import (
     ArtifactMap,
     CalibrationResult,
@@ -30,7 +37,6 @@ from selfcal_ros.model.result import (
     ViewResult,
 )
 from selfcal_ros.model.verdict import Finding
-from selfcal_ros.model.view import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,17 +258,17 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     found = law.solve(hu_readings(measurements.artifact, views))
     spread = _propagate(law, views)
     xy, theta = _noise(found, spread, measurements.views)
-    noise = noise_of(xy, theta)
+    noise, sense = noise_of(xy, theta), measurements.sense
     u_g, u_theta = spread.uncertainty(noise)
     if options.uncertainty is False:
         u_g, u_theta = np.full_like(u_g, np.nan), np.full_like(u_theta, np.nan)
-    g, g_theta = _to_stage(measurements.sense, found.g[..., 0], found.g_theta[:, 0], -1)
-    u_g, u_theta = _to_stage(measurements.sense, u_g, u_theta, 1)
+    (gx, gy), g_theta = _to_stage(sense, found.g[..., 0], found.g_theta[:, 0])
+    (u_gx, u_gy), u_theta = _to_stage(sense, u_g, u_theta, sign=1)
     artifact = measurements.artifact
     sites = artifact.shape[0] * artifact.shape[1]
     result = CalibrationResult(
         measurements.plan_id,
-        ErrorMap(artifact, g[0], g[1], u_g[0], u_g[1], g_theta, u_theta, float(found.o[0]),
+        ErrorMap(artifact, gx, gy, u_gx, u_gy, g_theta, u_theta, float(found.o[0]),
                  float(found.r[0]), law.datum),
         ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
         tuple(ViewResult(
@@ -274,7 +280,9 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
         noise,
         measurements.all_rejected(), findings=_findings(artifact, options), method="law",
-        sense=str(measurements.sense), run_id=measurements.run_id)
+        sense=str(sense), run_id=measurements.run_id,
+        extra={} if options.uncertainty is False else kept_covariance(
+            spread.covariances(noise, sense)))
     return Solved(result, xy, theta)
 
 
@@ -374,69 +382,53 @@ def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Effect of unit noise of every reading, for grid and for angular readings.
+    """Effect of unit noise of every reading, of grid and of angular readings.
 
-    `var_g` (2, 2, N, N), `var_theta` (2, K): the variances; `rest` (2,) and `rest_dof` (2,): the
+    `found`: what the law makes of each column of noise, of one kind and the other; `exact`:
+    whether there is a column for each reading, or random ones; `rest`, `rest_dof` (2,): the
     expected sums of squared residuals, of grid readings in XY and angular ones in theta, and their
     effective degrees of freedom.
     """
 
-    var_g: np.ndarray
-    var_theta: np.ndarray
+    found: tuple[HuSolution, HuSolution]
+    exact: bool
     rest: np.ndarray
     rest_dof: np.ndarray
 
     def uncertainty(self, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
         """Return the standard uncertainties of g (2, N, N) and g_theta (K,)."""
-        power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
-        return (np.sqrt(np.tensordot(power, self.var_g, axes=1)),
-                np.sqrt(np.tensordot(power, self.var_theta, axes=1)))
+        columns = 1.0 if self.exact else N_DRAWS
+        return (np.sqrt(self._summed(noise, lambda of: (of.g**2).sum(axis=-1)) / columns),
+                np.sqrt(self._summed(noise, lambda of: (of.g_theta**2).sum(axis=-1)) / columns))
+
+    def covariances(self, noise: Noise, sense: Sense) -> dict[str, np.ndarray]:
+        """Return the covariances of both maps, stage frame, m^2 and rad^2; none from draws."""
+        if not self.exact or not np.isfinite([noise.sigma_xy, noise.sigma_theta]).all():
+            return {}
+
+        def square(columns: np.ndarray) -> np.ndarray:
+            flat = columns.reshape(-1, columns.shape[-1])
+            return flat @ flat.T
+
+        return {"xy": self._summed(noise, lambda of: square(_to_stage(
+                    sense, of.g, of.g_theta)[0])),
+                "theta": self._summed(noise, lambda of: square(_to_stage(
+                    sense, of.g, of.g_theta)[1]))}
+
+    def _summed(self, noise: Noise, of: Callable[[HuSolution], np.ndarray]) -> np.ndarray:
+        """Return the sum over both kinds of readings of squares, times the variance of each."""
+        grid, lines = map(of, self.found)
+        return noise.sigma_xy**2 * grid + noise.sigma_theta**2 * lines
 
 
 def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
     """Propagate the noise of each reading: exactly up to EXACT_SIZE, else by draws."""
     exact = law.artifact.grid_size <= EXACT_SIZE
-    parts = []
-    for kind in range(2):
-        columns = _unit_noise(law.artifact, views, kind=kind, exact=exact)
-        found = law.solve(columns)
-        scale = 1.0 if exact else 1.0 / N_DRAWS
-        rest = found.rest_theta if kind else found.rest_xy
-        parts.append((scale * (found.g**2).sum(axis=-1), scale * (found.g_theta**2).sum(axis=-1),
-                      *_quadratic_form(rest, exact=exact)))
-    var_g, var_theta, rest, dof = (np.array(part) for part in zip(*parts, strict=True))
-    return _Spread(var_g, var_theta, rest, dof)
-
-
-def law_covariance(result: CalibrationResult) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the covariances of the law's maps for equal repeats, (2 sites, 2 sites) and (K, K).
-
-    In m^2 and rad^2, stage frame; None for plates beyond EXACT_SIZE, or without known noise.
-    """
-    artifact, noise = result.artifact, result.noise
-    power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
-    if artifact.grid_size > EXACT_SIZE or not np.isfinite(power).all():
-        return None
-    law = law_for(artifact, result.error_map.datum_theta, Sense(result.sense))
-    parts = []
-    for kind in range(2):
-        found = law.solve(_unit_noise(artifact, _full_views(artifact), kind=kind, exact=True))
-        g, theta = _to_stage(result.sense, found.g, found.g_theta, -1)
-        g = g.reshape(-1, g.shape[-1])
-        parts.append((power[kind] * (g @ g.T), power[kind] * (theta @ theta.T)))
-    (of_grid, theta_of_grid), (of_lines, theta_of_lines) = parts
-    return of_grid + of_lines, theta_of_grid + theta_of_lines
-
-
-def _full_views(artifact: Artifact) -> list[ViewReadings]:
-    """Return Hu's four views with every mark read once."""
-    k = np.arange(artifact.angular_count)
-    out = []
-    for marks in (artifact.grid_size, artifact.grid_size, 0, artifact.grid_size - 1):
-        m, n = artifact.m[:marks].ravel(), artifact.n[:marks].ravel()
-        out.append(ViewReadings(View(""), m, n, count=np.ones(len(m), dtype=int), k=k,
-                                count_theta=np.ones(len(k), dtype=int)))
-    return out
+    grid, lines = (law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact))
+                   for kind in range(2))
+    rest, dof = np.transpose([_quadratic_form(each, exact=exact)
+                              for each in (grid.rest_xy, lines.rest_theta)])
+    return _Spread((grid, lines), exact, rest, dof)
 
 
 def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
@@ -492,12 +484,11 @@ def _noise(found: HuSolution, spread: _Spread,
     return xy, theta
 
 
-def _to_stage(sense: str, field: np.ndarray, theta: np.ndarray,
-              sign: int) -> tuple[np.ndarray, np.ndarray]:
-    """Convert H(X) = -G(-X), Htheta(k) = -Gtheta(-k) to G; sign +1 for uncertainties."""
-    if sense != Sense.PLATE_MOVES:
-        return field, theta
-    return sign * field[:, ::-1, ::-1], sign * np.roll(theta[::-1], 1, axis=0)
+def _to_stage(sense: Sense, field: np.ndarray, theta: np.ndarray, *,
+              sign: int = -1) -> tuple[np.ndarray, np.ndarray]:
+    """Return maps (2, N, N, ...) and (K, ...) of the equations as those of the stage."""
+    return (turned_over(sense, field, sign=sign, axes=(1, 2)),
+            lines_turned_over(sense, theta, sign=sign))
 
 
 def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:

@@ -14,13 +14,13 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import (
     Part,
     Run,
+    _families,
     _of_run,
-    _parts,
     combine,
     mean_of,
     variance_between,
 )
-from selfcal_ros.estimation.comparison.covariance import theta_covariance, xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
@@ -176,18 +176,18 @@ def test_the_mean_keeps_its_covariance_in_its_file():
     found = combine([part("a", A), part("b", B)])
     read = result_from_dict(plain(result_to_dict(worded(found.result))), "mean")
     known = found.known.copy()
-    whole = xy_covariance(read, known)
+    whole = covariance_of(read, "xy", known)
     np.testing.assert_allclose(whole, found.xy.covariance, atol=1e-6 * whole.max())
     known[0, 1] = False
     chosen = np.tile(known.ravel(), 2)
-    np.testing.assert_array_equal(xy_covariance(read, known), whole[np.ix_(chosen, chosen)])
-    angular = theta_covariance(read, np.ones(ARTIFACT.angular_count, dtype=bool))
+    np.testing.assert_array_equal(covariance_of(read, "xy", known), whole[np.ix_(chosen, chosen)])
+    angular = covariance_of(read, "theta", np.ones(ARTIFACT.angular_count, dtype=bool))
     np.testing.assert_allclose(angular, found.theta.covariance, atol=1e-6 * angular.max())
     a, b = StageMap(read).length_uncertainty()
     assert 0 < a < 1e-6 and b >= 0
     damaged = replace(read, extra=read.extra | {"map_covariance": {"xy": [1.0], "scale_xy": 1.0}})
     with pytest.raises(InputError, match="no covariance of this map"):
-        xy_covariance(damaged, known)
+        covariance_of(damaged, "xy", known)
 
 
 def test_an_assumed_microscope_is_shared_by_all_runs():
@@ -252,7 +252,7 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
     np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
     assert "xy" not in found.result.extra.get("map_covariance", {})
-    assert xy_covariance(found.result, found.known).ndim == 1
+    assert covariance_of(found.result, "xy", found.known).ndim == 1
 
 
 @pytest.mark.parametrize(("kind", "size"), [
@@ -389,13 +389,12 @@ def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
     variances = np.array([3.0, 1.0, 2.0, 4.0, 6.0, 8.0]) * 1e-16  # nothing along the datum
     free = basis[:, 2:]
     values = rng.normal(size=(3, 6)) @ free.T
-    found = _parts(values, [free * variances @ free.T] * 3, q, shapes)
-    assert found.n_rest == 4
-    np.testing.assert_allclose(found.within, np.tile([3e-16, 1e-16], (3, 1)))
-    np.testing.assert_allclose(found.rest_within, 5e-16)
-    # 4 of 8 values are independent
-    np.testing.assert_allclose(found.rest, np.sqrt(2) * values @ others @ others.T, atol=1e-12)
-    np.testing.assert_allclose(found.rest_share, (others**2).sum(axis=1))
+    *of_shapes, rest = _families(values, [free * variances @ free.T] * 3, q, shapes)
+    np.testing.assert_allclose([family.within[0] for family in of_shapes], [3e-16, 1e-16])
+    np.testing.assert_allclose(rest.within, 5e-16)
+    assert rest.most == 4  # of 8 values are independent
+    np.testing.assert_allclose(rest.values, np.sqrt(2) * values @ others @ others.T, atol=1e-12)
+    np.testing.assert_allclose(rest.share, (others**2).sum(axis=1))
 
 
 @pytest.mark.parametrize(("p", "p_z", "both"), [(0.01, 0.3, 0.02), (0.3, 0.01, 0.02),

@@ -10,9 +10,8 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import (
+    covariance_of,
     first_order_u,
-    theta_covariance,
-    xy_covariance,
 )
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
@@ -56,7 +55,7 @@ def test_covariance_of_a_saved_map(sense, reference):
     result = calibrate(readings, options)
     known = result.error_map.valid
     assert all(np.ndim(view.read_grid) == 0 for view in result.views if view.read_grid is not None)
-    found = xy_covariance(result, known)
+    found = covariance_of(result, "xy", known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert abs(found - wanted).max() < 1e-6 * wanted.max()
 
@@ -71,7 +70,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     result = calibrate(readings, options)
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
     known = result.error_map.valid
-    found = xy_covariance(saved, known)
+    found = covariance_of(saved, "xy", known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert abs(found - wanted).max() < 1e-4 * wanted.max()
     u = np.concatenate([result.error_map.u_gx[known], result.error_map.u_gy[known]])
@@ -79,7 +78,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     shear = first_order_u(saved)
     assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
     alone = replace(saved, extra={})
-    assert xy_covariance(alone, known).ndim == 1
+    assert covariance_of(alone, "xy", known).ndim == 1
     assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
 
 
@@ -90,14 +89,14 @@ def test_weights_that_are_none_are_refused(read, message):
     result = calibrate(measured(PLAN, 1), BARE)
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
     with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result again"):
-        xy_covariance(replace(result, views=views), result.error_map.valid)
+        covariance_of(replace(result, views=views), "xy", result.error_map.valid)
 
 
 def test_factors_of_another_lattice_are_refused():
     result = calibrate(measured(PLAN, 1), BARE)
     extra = {"covariance_terms": {"terms": [""], "factors": [[[1.0, 2.0], [3.0, 4.0]]]}}
     with pytest.raises(InputError, match="covariance_terms: no factors of this lattice"):
-        xy_covariance(replace(result, extra=extra), result.error_map.valid)
+        covariance_of(replace(result, extra=extra), "xy", result.error_map.valid)
 
 
 def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
@@ -112,9 +111,9 @@ def test_without_weights_only_the_variances_are_known():
     result = calibrate(measured(PLAN, 1), BARE)
     emap, bare_views = result.error_map, replace(result, views=tuple(
         replace(v, read_grid=None, read_angular=None) for v in result.views))
-    found = xy_covariance(bare_views, emap.valid)
+    found = covariance_of(bare_views, "xy", emap.valid)
     assert found.tolist() == [*(emap.u_gx[emap.valid]**2), *(emap.u_gy[emap.valid]**2)]
-    assert theta_covariance(bare_views, np.isfinite(emap.g_theta)).ndim == 1
+    assert covariance_of(bare_views, "theta", np.isfinite(emap.g_theta)).ndim == 1
     assert np.isnan(first_order_u(bare_views)).all()
 
 
@@ -142,9 +141,9 @@ def require_covariances(result, answers, *, theta=1e-6):
     sites = result.artifact.shape[0] * result.artifact.shape[1]
     of_readings = answers.T @ answers
     for covariance, wanted, tolerance in (
-            (xy_covariance(result, result.error_map.valid),
+            (covariance_of(result, "xy", result.error_map.valid),
              of_readings[:2 * sites, :2 * sites], 1e-6),
-            (theta_covariance(result, np.isfinite(result.error_map.g_theta)),
+            (covariance_of(result, "theta", np.isfinite(result.error_map.g_theta)),
              of_readings[2 * sites:, 2 * sites:], theta)):
         assert abs(covariance - wanted).max() < tolerance * wanted.max()
 

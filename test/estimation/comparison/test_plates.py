@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import plate_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact
@@ -77,5 +77,5 @@ def test_u_off_the_lattice_is_what_each_reading_does_to_the_plate():
     u = np.concatenate([plate.u_ax.ravel(), plate.u_ay.ravel()])
     assert known.all()
     assert u == pytest.approx(np.sqrt(np.diag(wanted)), rel=1e-6)
-    cover = plate_covariance(result, known)
+    cover = covariance_of(result, "xy", known, plate=True)
     assert np.abs(cover - wanted).max() < 1e-5 * wanted.max()

@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.camera import Distortion, straight_products
 from selfcal_ros.estimation.joint.images import IMAGES, image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
@@ -134,7 +134,7 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
     known = result.error_map.valid.copy()
     known[0, 1] = False
     rows = np.concatenate([gain[known, 0], gain[known, 1]])
-    found = xy_covariance(result, known)
+    found = covariance_of(result, "xy", known)
     wanted = rows @ covariance @ rows.T
     assert found.shape == (48, 48)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * wanted.max())

@@ -14,9 +14,8 @@ from scipy.stats import chi2, f
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import (
+    covariance_of,
     first_order_u,
-    theta_covariance,
-    xy_covariance,
 )
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.options import Options, ReferenceLength
@@ -119,10 +118,10 @@ def require_same(result, wanted, *, rel=1e-5):
             assert np.abs(value - of).max() < rel * spread.min()
     shear = require_first_order(emap)
     assert first_order_u(result) == pytest.approx(wanted.of(shear @ wanted.after)[1], rel=rel)
-    cover = xy_covariance(result, emap.valid)
+    cover = covariance_of(result, "xy", emap.valid)
     assert cover == pytest.approx(wanted.after @ wanted.after.T, abs=rel * cover.max())
     if wanted.K:
-        cover = theta_covariance(result, np.isfinite(emap.g_theta))
+        cover = covariance_of(result, "theta", np.isfinite(emap.g_theta))
         assert cover == pytest.approx(wanted.after_theta @ wanted.after_theta.T,
                                       abs=rel * cover.max())
     u = np.linalg.norm(wanted.scale)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.verdict.uncertainty import (
     INTERPOLATION,
     Effect,
@@ -76,8 +76,8 @@ def test_a_saved_map_has_the_covariance_of_its_effects(result):
     larger = enlarged(result, (slip, turned, nothing))
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(larger)))), "r")
     assert saved.extra["covariance_terms"]["terms"][-2:] == ["slip", "rotation"]
-    found = xy_covariance(saved, known)
-    wanted = xy_covariance(result, known)
+    found = covariance_of(saved, "xy", known)
+    wanted = covariance_of(result, "xy", known)
     for effect in (slip, turned):
         flat = effect.xy[:, known].ravel()
         wanted = wanted + np.outer(flat, flat)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.covariance import xy_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
@@ -67,7 +67,7 @@ def test_a_drift_that_the_order_hides_is_assumed(sense):
 
 def test_its_nodes_are_correlated_as_by_the_declared_term():
     readings, _ = measured(consecutive=True)
-    one, other = (xy_covariance(result, result.error_map.valid) for result in (
+    one, other = (covariance_of(result, "xy", result.error_map.valid) for result in (
         calibrate(readings, Options()), calibrate(readings, Options(terms=(DRIFT,)))))
     np.testing.assert_allclose(one, other, atol=0.05 * np.abs(other).max())
 
