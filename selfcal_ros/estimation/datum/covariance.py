@@ -31,16 +31,18 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import (
+    BLOCK,
     Marks,
     Memo,
     NormalEquations,
     PlacedSystem,
+    in_datum,
     system_of,
 )
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.pose import LatticePose
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 
 NO_NOISE_M = 1e-100
 """Stands for zero noise; its square is still representable."""
@@ -337,8 +339,9 @@ class MapsCovariance:
         """Return the variances of the stage's map in a datum as in `_datum`, (2, sites)."""
         grid = self.system.grid
         field, _, taken = self._solved(g, a)
-        return self._in_datum(grid.factor.inverse_diagonal(), grid.response, self.terms.fields,
-                              field - self.terms.fields @ taken, fields, self.of_free(g, a))
+        return in_datum(grid.factor.inverse_diagonal(),
+                        ((grid.response, self._p), (self.terms.fields, self.terms.covariance)),
+                        field - self.terms.fields @ taken, fields, self.of_free(g, a))
 
     def _of_marks(self, grid: PlacedSystem, fields: np.ndarray, g: np.ndarray,
                   a: np.ndarray) -> np.ndarray:
@@ -347,23 +350,9 @@ class MapsCovariance:
         field, parameters, taken = self._solved(g, a)
         spread = self._plates(field, parameters) + self._noise[:, None] * a - plates @ taken
         answer = self._plates(-grid.response, np.eye(len(self._p)))
-        return self._in_datum(self._noise + grid.variance_of_means(), answer, plates, spread,
-                              fields, self.of_free(g, a))
-
-    def _in_datum(self, own: np.ndarray, answer: np.ndarray, terms: np.ndarray, spread: np.ndarray,
-                  fields: np.ndarray, inner: np.ndarray) -> np.ndarray:
-        """Return the variances of a map in its datum, (2, places).
-
-        From those of readings alone, the answers to misalignments and terms, the covariance with
-        the functionals of the datum, its fields, and the covariance of the functionals.
-        """
-        out = []
-        for part in (np.real, np.imag):
-            b, s, y, t = part(fields), part(spread), part(answer), part(terms)
-            value = own + np.einsum("sa,sa->s", y @ self._p, y)
-            value += np.einsum("sp,sp->s", t @ self.terms.covariance, t)
-            out.append(value + np.einsum("sk,sk->s", b @ inner + 2 * s, b))
-        return np.maximum(out, 0.0)
+        return in_datum(self._noise + grid.variance_of_means(),
+                        ((answer, self._p), (plates, self.terms.covariance)), spread, fields,
+                        self.of_free(g, a))
 
     def _plates(self, fields: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return what maps (sites, k) and misalignments (3 views, k) make of the plate."""
@@ -404,9 +393,6 @@ MISCLOSURE_LEVEL = 0.05
 
 CLOSED_RAD = 1e-12
 """Misclosure attributed to rounding, rad."""
-
-BLOCK = 512
-"""Number of lines computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -474,19 +460,13 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
 def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                 half_width_m: float) -> Conditions:
     known, n_lines = system.known_lines, system.angular.n_lines
-    flipped = sense is Sense.PLATE_MOVES
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:
             raise InputError("theta datum xy_axes", f"of {n_lines} lines, none lies on the y axis",
                              "use zero_mean")
-        sites = system.known_sites[::-1, ::-1] if flipped else system.known_sites
-        slopes = slope_rows(system.grid.views.z_sites * half_width_m, sites)
-        lines = np.arange(4) * (n_lines // 4)
-        rows = np.zeros((4, n_lines))
-        rows[np.arange(4), lines] = 1.0
-        if flipped:
-            rows = -rows[:, -np.arange(n_lines) % n_lines]
-            slopes = -slopes[:, ::-1, ::-1]
+        sites = turned_over(sense, system.known_sites, sign=1)
+        slopes = turned_over(sense, slope_rows(system.grid.views.z_sites * half_width_m, sites))
+        rows = lines_turned_over(sense, np.eye(n_lines)[:, ::n_lines // 4]).T
         _require_axes(sites, [bool(known[row != 0].all()) for row in rows])
         return _solve_conditions(system, rows, slopes)
     rows = np.atleast_2d(known / max(known.sum(), 1))
@@ -592,11 +572,9 @@ class LinesCovariance:
             here, here - here[0]] for here in self._blocks()])
         phi = self.cover.inverse[np.ix_(self.system.phi_at, self.system.phi_at)] * (
             self._xy2 / self.cover.length**2)
-        own = self._theta2 * inverse + np.einsum("ka,ab,kb->k", y, phi, y)
-        own += np.einsum("kp,pq,kq->k", self.terms[0], self._of_terms, self.terms[0])
-        spread = self._spread(*misclosure)[0]
-        variance = own + _by(conditions.gain, closure, spread)
-        return np.where(self.system.known_lines, np.maximum(variance, 0.0), np.nan), closure
+        variance = in_datum(self._theta2 * inverse, ((y, phi), (self.terms[0], self._of_terms)),
+                            self._spread(*misclosure)[0], conditions.gain, closure)[0]
+        return np.where(self.system.known_lines, variance, np.nan), closure
 
     def of_plate(self) -> np.ndarray:
         """Return the variance of the plate's angular map, (K,), in the datum `zero_mean`.
@@ -615,8 +593,8 @@ class LinesCovariance:
             own[here] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
             own[here] += self._xy2 * np.einsum("vl,vw,wl->l", factors, self.cover.inverse, factors)
             own[here] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
-        variance = own + self._of_means + _by(np.ones((count, 1)), self.of(*datum),
-                                              self._spread(*datum)[1])
+        variance = in_datum(own + self._of_means, (), self._spread(*datum)[1],
+                            np.ones((count, 1)), self.of(*datum))[0]
         return np.where(system.known_plate_lines, variance, np.nan)
 
     def of(self, stage: np.ndarray, plate: np.ndarray,
@@ -681,11 +659,6 @@ class LinesCovariance:
     def _blocks(self) -> list[np.ndarray]:
         n = self.angular.n_lines
         return [np.arange(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
-
-
-def _by(fields: np.ndarray, inner: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return what fields (K, k) times functionals add to the variances of a free map, (K,)."""
-    return np.einsum("kc,kc->k", fields @ inner + 2 * spread, fields)
 
 
 def lines_alone(system: NormalEquations) -> LinesCovariance:

@@ -176,11 +176,12 @@ class AngularSystem:
 
 
 KNOWN = 3.0
-"""Largest standard uncertainty (rms over the circle) of a harmonic that counts as determined, in
-units of the noise of one reading."""
+"""Largest standard uncertainty, in units of the noise of one reading, of a node that is known, or
+(rms over the circle) of a harmonic: what is known no worse is corrected rather than left."""
 
 GAP = 1e-9
-"""Relative eigenvalue of the matrix below which a combination of coefficients is undetermined."""
+"""Relative size below which an eigenvalue of a matrix of misalignments, or of coefficients of a
+series, is zero: true zeros are near 1e-15 and the smallest others above 1e-4."""
 
 
 class HarmonicSystem(AngularSystem):

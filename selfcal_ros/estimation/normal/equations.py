@@ -32,15 +32,14 @@ from selfcal_ros.estimation.lattice.readings import (
     in_field,
     pose_of,
 )
-from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
+from selfcal_ros.estimation.normal.angular import GAP, KNOWN, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
-GAP = 1e-9
-"""Relative size below which an eigenvalue of a misalignment matrix is zero; true zeros are
-near 1e-15 and the smallest others above 1e-4."""
+UNMOVED = 1e-6
+"""Change of a value by a misalignment of unit length up to which it is rounding, of 1e-9."""
 
 CORE_SITES = 41
 """Sites per side of the middle part of a large field."""
@@ -197,12 +196,12 @@ class NormalEquations:
         none[:, :3 * self.grid.n_views] = self.grid.differences.T
         datum = np.vstack([self.rigid, *[self._turn_of_lines] * self.apart, none])
         rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
-        rigid = rigid[:, size > 1e-9 * size[0]]
+        rigid = rigid[:, size > GAP * size[0]]
         if rigid.shape[1] == self.nullity:  # no reading determines the datum
             return np.zeros((self.size, 0))
         residual = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(residual, full_matrices=False)
-        return u[:, s > 1e-6]
+        return u[:, s > UNMOVED]
 
     @property
     def hides_fields(self) -> bool:
@@ -231,13 +230,13 @@ class NormalEquations:
         hidden = self.unseen[:3 * self.grid.n_views]
         parts = self.grid.components
         known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
-        if np.any(np.abs(hidden) > 1e-6) and known.any():
+        if np.any(np.abs(hidden) > UNMOVED) and known.any():
             moved = self.grid.response @ hidden
             gauge = Gauge(self.grid.views.z_sites, known.reshape(self.grid.views.shape), scale=True)
             for column in moved.T:
                 field = column.reshape(self.grid.views.shape)
                 residual = gauge.remove(field, gauge.parts(field)).ravel()
-                known &= abs(residual) <= 1e-6
+                known &= abs(residual) <= UNMOVED
         return known.reshape(self.grid.views.shape)
 
     @property
@@ -271,7 +270,7 @@ class NormalEquations:
             moved = column - parts @ self.rigid[:4]
             plate, _ = self.grid.plate(nothing, self.gauge.remove(field, parts), moved[:n])
             moved = moved - self.plate_gauge.parts(plate) @ self.rigid[4:]
-            known &= abs(moved) <= 1e-6
+            known &= abs(moved) <= UNMOVED
         return known & (self._turn_of_lines == 0) if self.apart else known
 
     @cached_property
@@ -291,7 +290,7 @@ class NormalEquations:
         if self.unseen.shape[1] and known.any():
             moved = self.angular.response @ self.unseen[self.phi_at]
             moved = moved - moved[known].mean(axis=0)
-            known = known & np.all(abs(moved) <= 1e-6, axis=1)
+            known = known & np.all(abs(moved) <= UNMOVED, axis=1)
         return known
 
     @cached_property
@@ -334,6 +333,35 @@ def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.
     return (vectors[:, good] / values[good]) @ vectors[:, good].T
 
 
+def in_datum(own: np.ndarray, answers: Sequence[tuple[np.ndarray, np.ndarray]],
+             spread: np.ndarray, fields: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Return the variances of a map in its datum, (2, places); of a real map twice the same.
+
+    The map is a free one plus each field times a functional of free maps.
+
+    Parameters
+    ----------
+    own : float array (places,)
+        Variance of each value by the readings alone.
+    answers : sequence of (places, p) and (p, p)
+        What misalignments or terms make of the map, and their covariance.
+    spread : array (places, k)
+        Covariance of the free map with the functionals.
+    fields : array (places, k)
+        The fields.
+    inner : float array (k, k)
+        Covariance of the functionals.
+    """
+    out = []
+    for part in (np.real, np.imag):
+        field = part(fields)
+        value = own + np.einsum("pk,pk->p", field @ inner + 2 * part(spread), field)
+        for answer, covariance in answers:
+            value += np.einsum("pa,pa->p", part(answer) @ covariance, part(answer))
+        out.append(value)
+    return np.maximum(out, 0.0)
+
+
 def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     """Return the residuals of the grid readings `y` (views, nx, ny), fitted alone."""
     return system.grid.plate(y, *system.alone(y))[1]
@@ -349,17 +377,11 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     return angular.plate(y, free - angular.response @ phi, phi)[1]
 
 
-KNOWN = 3.0
-"""Largest standard uncertainty of a known node, in units of the noise of one reading."""
-
 CORE = 0.75
 """Distance from the centre, in half widths, within which nodes fix the first datum."""
 
 VAGUE = 1e-13
 """Information on every node, relative to the mean, that keeps the factorisation alive."""
-
-UNMOVED = 1e-6
-"""Change of a node by a misalignment of unit length up to which it is rounding."""
 
 LOOSE = 10.0
 """Standard uncertainty of an undetermined field, in units of the noise of one reading."""
@@ -544,8 +566,8 @@ class PlacedEquations(NormalEquations):
             known = some & (largest.reshape(views.shape) < KNOWN**2)
         return known
 
-    def _variances(self, datum: Gauge, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances of Gx and Gy at the nodes in a datum over some, unit noise.
+    def _variances(self, datum: Gauge, inverse: np.ndarray) -> np.ndarray:
+        """Return the variances of Gx and Gy at the nodes in a datum over some, (2, nodes).
 
         `inverse` is the covariance of the misalignments, (size, size).
         """
@@ -553,12 +575,8 @@ class PlacedEquations(NormalEquations):
         factor, response, own = self.grid.factor, self.grid.response, inverse[:n, :n]
         spread = factor.inverse @ rigid + response @ (
             own @ np.real(response.conj().T @ rigid))
-        inner, out = np.real(rigid.conj().T @ spread), []
-        for part in (np.real, np.imag):
-            b, s, y = part(datum.everywhere), part(spread), part(response)
-            out.append(factor.inverse_diagonal() + np.einsum("pa,pa->p", y @ own, y)
-                       + np.einsum("pk,pk->p", b @ inner - 2 * s, b))
-        return out[0], out[1]
+        return in_datum(factor.inverse_diagonal(), ((response, own),), spread, -datum.everywhere,
+                        np.real(rigid.conj().T @ spread))
 
     @cached_property
     def loose_modes(self) -> np.ndarray:

@@ -53,7 +53,12 @@ from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import (
+    Measurements,
+    ViewReadings,
+    lines_turned_over,
+    turned_over,
+)
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm
@@ -280,8 +285,9 @@ def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
 
     field, known = solution.field, solution.known
     rows = solution.rows[:2 * known.size].reshape(2, *known.shape, -1)
-    if readings.measurements.sense is Sense.PLATE_MOVES:  # G(X) = -H(-X)
-        field, known, rows = -field[::-1, ::-1], known[::-1, ::-1], -rows[:, ::-1, ::-1]
+    sense = readings.measurements.sense
+    field, known = turned_over(sense, field), turned_over(sense, known, sign=1)
+    rows = turned_over(sense, rows, axes=(1, 2))
     both = np.tile(known.ravel(), 2)
     return NewMap(both, stacked(field.ravel())[both], rows.reshape(len(both), -1)[both], noise,
                   of_plate, before, xy.dof, of_plate @ plate.length_at(marks)), solution
@@ -317,9 +323,8 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
         whole = noise.covariance + before[count:, count:][np.ix_(line, line)]
         rows = line_rows(angular.turns, weight, whole, angular.harmonics)
     values = rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
-    if readings.measurements.sense is Sense.PLATE_MOVES:
-        back = -np.arange(count) % max(count, 1)
-        values, rows = -values[back], -rows[back]
+    values, rows = (lines_turned_over(readings.measurements.sense, part)
+                    for part in (values, rows))
     determined = rows.any(axis=1)
     return NewMap(determined, values[determined], rows[determined], noise, of_plate, before,
                   theta.dof)

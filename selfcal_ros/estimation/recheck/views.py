@@ -20,10 +20,9 @@ from selfcal_ros.estimation.joint.problem import Moving, Problem
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import rotation_excess
-from selfcal_ros.estimation.normal.angular import HarmonicSystem
+from selfcal_ros.estimation.normal.angular import KNOWN, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import (
     CORE,
-    KNOWN,
     VAGUE,
     Marks,
     PlacedSystem,
