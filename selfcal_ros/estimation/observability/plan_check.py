@@ -100,8 +100,8 @@ def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
     return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(known)[0]))
 
 
-SEARCH_SIZE = 9
-"""Largest field for the search of a curing view, which is then verified on the real field."""
+SEARCH_SIZE = 11
+"""Largest field on which views are searched for: what is found is then evaluated in full."""
 
 NARROW = 5
 """Smallest number of sites across a reduced field."""
@@ -180,13 +180,14 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     Fields above MAX_SITES are predicted on a smaller field, which is the shape of the result: the
     gain grows slowly, as log N, so the prediction is then too small.
     """
-    artifact = plan.artifact
-    if artifact.shape[0] * artifact.shape[1] <= MAX_SITES:
-        return predict(planned_system(artifact, plan.views), artifact, datum,
-                       repeats=unit_repeats(plan))
-    small = smaller(plan, PROXY_SIZE)
-    return predict(planned_system(small.artifact, small.views), small.artifact, datum,
+    judged = predicted_on(plan)
+    return predict(planned_system(judged.artifact, judged.views), judged.artifact, datum,
                    repeats=unit_repeats(plan))
+
+
+def predicted_on(plan: Plan) -> Plan:
+    """Return the plan, on a field of PROXY_SIZE sites per side if its own has above MAX_SITES."""
+    return smaller(plan, PROXY_SIZE) if math.prod(plan.artifact.shape) > MAX_SITES else plan
 
 
 def unit_repeats(plan: Plan) -> int:
@@ -260,7 +261,7 @@ def smaller(plan: Plan, size: int) -> Plan:
     even or odd numbers, and is large enough for the plan's own shifts. A list of marks remains as
     it is.
     """
-    if plan.artifact.marks:
+    if plan.artifact.marks or max(plan.artifact.shape) <= size:
         return plan
     reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
              for view in with_sub_views(plan.views)]

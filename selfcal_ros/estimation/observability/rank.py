@@ -443,9 +443,6 @@ def as_map(field: np.ndarray) -> np.ndarray:
     return both / max(float(abs(both).max()), np.finfo(float).tiny)
 
 
-TURNS = (1, 1j, -1, -1j)
-
-
 def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     """Return a key that is the same for equivalent plans, from their turns and shifts.
 
@@ -473,5 +470,5 @@ def _moved(q: float, shift: complex, mirror: bool, stage: int,
            plate: int) -> tuple[float, float, float]:
     if mirror:
         q, shift = -q, shift.conjugate()
-    shift = shift * TURNS[stage]
+    shift = shift * complex(PHASES[stage])
     return (q + plate) % 4, shift.real + 0.0, shift.imag + 0.0

@@ -26,13 +26,13 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.plan_check import (
-    MAX_SITES,
-    PROXY_SIZE,
+    SEARCH_SIZE,
     Prediction,
     Step,
     check_stops,
     more_views,
     other_orders,
+    predicted_on,
     smaller,
     unit_repeats,
 )
@@ -121,9 +121,7 @@ class PlannedTerms:
 
     @one_thread()
     def __init__(self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed) -> None:
-        artifact = plan.artifact
-        if artifact.shape[0] * artifact.shape[1] > MAX_SITES:
-            plan = smaller(plan, PROXY_SIZE)
+        plan = predicted_on(plan)
         self.model, self.assumed = tuple(model), assumed
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
@@ -185,11 +183,8 @@ class PlannedTerms:
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
-        every, others = self.every, self._others(name)
-        term, model = every.rows([name]), rows_of(every.columns, others)
-        beside = with_terms(every, others)
-        taken = beside.inverse(self.assumed.sigma_m) @ beside.unbiased_sums(
-            every.information[np.ix_(model, term)])
+        every, term = self.every, self.every.rows([name])
+        model, taken, _ = self._remainder(name, self._others(name), self.assumed.sigma_m)
         fields = every.maps[:, term] - every.maps[:, model] @ taken
         known = every.system.known_sites.ravel()
         spread = size * np.sqrt(np.stack([(fields.real**2).sum(axis=1),
@@ -197,9 +192,10 @@ class PlannedTerms:
         return rms(spread), float(spread.max())
 
     def _power(self, name: str, size: float, level: float) -> float:
-        every, others = self.every, self._others(name)
-        beside = with_terms(every, [ModelTerm(term.name) for term in others])
-        values, rank = self._information(name, beside)
+        every = self.every
+        others = [ModelTerm(term.name) for term in self._others(name)]
+        beside = with_terms(every, others)
+        values, rank = self._information(name, others)
         grid = every.system.grid
         dof = (2 * grid.n_readings - every.system.rank_grid + every.columns.within.dof
                - beside.rank() - rank)
@@ -213,15 +209,22 @@ class PlannedTerms:
         noise = rng.chisquare(dof, DRAWS) / dof
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
-    def _information(self, name: str, beside: TermEquations) -> tuple[np.ndarray, int]:
+    def _remainder(self, name: str, others: Sequence[ModelTerm],
+                   sigma_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the columns of other terms, bool (p,), and what they take of those of a term.
+
+        The latter (o, t), and the information that is left on the term, (t, t).
+        """
+        every, term = self.every, self.every.rows([name])
+        beside, columns = with_terms(every, others), rows_of(every.columns, others)
+        cross = every.information[np.ix_(columns, term)]
+        taken = beside.inverse(sigma_m) @ beside.unbiased_sums(cross)
+        return columns, taken, every.information[np.ix_(term, term)] - cross.T @ taken
+
+    def _information(self, name: str, others: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
-        every = self.every
-        term = every.rows([name])
-        others = rows_of(every.columns,
-                         [ModelTerm(n) for n in {c.term for c in beside.columns.columns}])
-        cross = every.information[np.ix_(others, term)]
-        rest = every.information[np.ix_(term, term)] - cross.T @ beside.inverse(
-            0.0) @ beside.unbiased_sums(cross)
+        every, term = self.every, self.every.rows([name])
+        rest = self._remainder(name, others, 0.0)[2]
         norm = every.norm[term]
         scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
         rank = int((scaled > every.limit(term)).sum())
@@ -281,9 +284,6 @@ NEGLIGIBLE = 1e-6
 
 REMOVED = 0.7
 """Part of a line that may be left by what removes it."""
-
-SEARCH_SIZE = 11
-"""Largest field on which removals are tried."""
 
 CERTIFICATE = "certificate"
 """Kind of a removal: better knowledge of the term, given as its size."""
@@ -346,9 +346,7 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
     asked : iterable of str
         The terms that somebody declared, also to be zero; the others are defaults.
     """
-    if plan.artifact.shape[0] * plan.artifact.shape[1] > MAX_SITES:
-        plan = smaller(plan, PROXY_SIZE)
-    asked = set(asked)
+    plan, asked = predicted_on(plan), set(asked)
     budget = _budget(plan, terms, assumed, alone, asked=asked)
     if more := _untold(budget, plan, terms, assumed, asked=asked):
         terms = [*terms, *more]
@@ -409,7 +407,7 @@ def effects_of_terms(plan: Plan, terms: Iterable[ModelTerm], assumed: Assumed,
 def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
               assumed: Assumed) -> dict[tuple[str, str], Removal]:
     """Return what removes each line that matters; tried on a field of at most SEARCH_SIZE sites."""
-    judged = smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > SEARCH_SIZE else plan
+    judged = smaller(plan, SEARCH_SIZE)
     tried: dict[tuple, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
 
     def effect(step: Step, line: BudgetLine) -> float:

@@ -16,6 +16,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.plan_check import (
+    SEARCH_SIZE,
     Prediction,
     Step,
     candidate_views,
@@ -119,9 +120,6 @@ def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[P
         yield from ((angle, x, to + 0.0) for to in [round(y + sign * shift, 1)]
                     if abs(to) <= reach)
 
-
-SEARCH_SIZE = 11
-"""Largest field for the comparison of plans in a search; the best are then evaluated in full."""
 
 FULL_SIZE = 41
 """Largest field on which every candidate is evaluated in full."""
@@ -325,7 +323,7 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     candidates = [measured_like(view, like) for view in candidate_views(artifact, angular=angular)]
     pool = [view for view in candidates if view.grid]
     whole = Plan("best", artifact, ())
-    small = smaller(whole, SEARCH_SIZE) if max(artifact.shape) > SEARCH_SIZE else whole
+    small = smaller(whole, SEARCH_SIZE)
     tried, how = _search(small, pool, n_views - 1 - fixed, criterion=criterion, against=against,
                          progress=progress)
     if small is not whole:

@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.normal.equations import planned_system
-from selfcal_ros.estimation.observability import resistance
+from selfcal_ros.estimation.observability import plan_check, resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms, nominal_sizes
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
@@ -197,8 +197,8 @@ def test_a_power_is_the_rate_of_drawn_tests():
 
 
 def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
-    monkeypatch.setattr(resistance, "MAX_SITES", 100)
-    monkeypatch.setattr(resistance, "PROXY_SIZE", 9)
+    monkeypatch.setattr(plan_check, "MAX_SITES", 100)
+    monkeypatch.setattr(plan_check, "PROXY_SIZE", 9)
     large, small = (PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9))
     assert check_terms(large, {}, LEVEL) == check_terms(small, {}, LEVEL)
 
