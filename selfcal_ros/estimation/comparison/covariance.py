@@ -256,7 +256,7 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
         If they are not weights of this field.
     """
     wrong = "no weights of this field"
-    if np.ndim(kept) == 0:
+    if not isinstance(kept, list | np.ndarray):
         weight = kept_numbers({where: kept}, where, (), where, wrong) * field
     else:
         weight = kept_numbers({where: kept}, where, field.shape, where, wrong)

@@ -84,7 +84,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
 
 @pytest.mark.parametrize(("read", "message"), [
     ("x", "no weights of this field"), ([[1, 2], [3, 4]], "no weights of this field"),
-    (-1, "no weights of this field")])
+    ([[1, 2], [3]], "no weights of this field"), (-1, "no weights of this field")])
 def test_weights_that_are_none_are_refused(read, message):
     result = calibrate(measured(PLAN, 1), BARE)
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
