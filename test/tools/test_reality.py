@@ -237,6 +237,13 @@ def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
     assert first.holds or first.grade == "not_qualified"
 
 
+def test_lines_of_the_other_sign_are_not_taken_for_a_microscope_turned_over():
+    """A scale of -1 would explain them here: a size beyond all that is plausible is a fault."""
+    case, = (c for c in every_case() if c.name.startswith("offsets of the other sign, lines alone"))
+    first = run_case(case, 30).first
+    assert (first.grade, first.causes) == ("refused", ("WiringError",))
+
+
 def test_the_page_lists_the_cases_with_more_wrong_runs_than_one_in_twenty():
     first = Summary(40, {"good": 1, "enlarged": 39}, 2, (3, 7), 2e-8, within=0.97, u_within=0.0035,
                     within_x=0.96, within_y=0.98, within_theta=math.nan, z_xy=0.889,

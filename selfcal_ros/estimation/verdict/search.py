@@ -305,7 +305,10 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
 
 
 def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
-    """Return a contradicted size of a term as a cause; None if it does not matter."""
+    """Return a contradicted size of a term as a cause; None if it does not matter.
+
+    A size that is not plausible is a fault, however little of it is seen in the map.
+    """
     term = next(term for term in solved.result.model.terms if term.name == test.name)
     parts = enlargements(solved.result, [term.name], [])
     u = rms(solved.result.error_map.u_xy)
@@ -314,7 +317,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
     held = fitted_term(solved.joint, term.name, test.p,
                    whole=little or test.rank == len(term.estimates))
-    if not _counts(held, solved):
+    if not _counts(held, solved) and test.allowed <= block_of(test.name).plausible:
         return None
     if block_of(test.name).between and abs(
             (cause := cause_of(held, solved.joint.problem.ground)).size) > BEYOND * cause.u:
