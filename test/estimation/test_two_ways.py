@@ -171,9 +171,9 @@ def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
                   for row, view in enumerate(readings.views))
     left = residuals_of(replace(readings, views=views), BARE)
     assert left.lines.redundancy[0, 7] < 1e-9 and np.isnan(left.lines.squares[0, 7])
-    assert left.redundancy_theta.sum() == pytest.approx(left.found.theta.dof_residuals)
+    assert left.lines.redundancy.sum() == pytest.approx(left.lines.dof)
     # lines beside the gap are checked by fewer readings than the others
-    assert np.ptp(left.redundancy_theta[left.redundancy_theta > 0.05]) > 0.1
+    assert np.ptp(left.lines.redundancy[left.lines.redundancy > 0.05]) > 0.1
 
 
 ROUGH = Spread(a_m=20e-6, phi_rad=0.02)

@@ -778,7 +778,7 @@ def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
         if mean.p_between < RUNS_LEVEL:
             u, name, unit = np.sqrt(mean.between), BETWEEN + SUFFIX[kind], KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
-            failed.append(Finding(BETWEEN, mean.u_between, unit=unit, p=mean.p_between,
+            failed.append(Finding("between_runs", mean.u_between, unit=unit, p=mean.p_between,
                                   details={"runs": len(parts), "quantity": kind}))
     for part in parts:
         for item in part.result.verdict.enlarged_by if part.result else ():

@@ -9,7 +9,7 @@ that term were known, or to the free terms together.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sized
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -294,7 +294,8 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
         return np.zeros((0, *shape))
     wrong = "no factors of this lattice"
     factors = kept_numbers(result.extra[KEY], "factors", (-1, *shape), KEY, wrong)
-    if len(factors) != len(result.extra[KEY].get("terms", ())):
+    terms = result.extra[KEY].get("terms")
+    if not isinstance(terms, Sized) or len(factors) != len(terms):
         raise not_kept(KEY, wrong)
     return factors
 
