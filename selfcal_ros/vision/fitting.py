@@ -317,9 +317,9 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         values, before = windows.values[running], p[running]
         image, jacobian, shape = _image(model, disc.u, disc.v, before)
         residual = values - image
-        spread = MAD * row_medians(np.abs(residual))[:, 0]
-        limit = np.maximum(STAIN * np.abs(before[:, 3]), STAIN_SIGMAS * spread)
-        used = np.abs(residual) <= limit[:, None]
+        spread = MAD * row_medians(np.abs(residual))
+        limit = np.maximum(STAIN * np.abs(before[:, 3:4]), STAIN_SIGMAS * spread)
+        used = np.abs(residual) <= limit
         enough = used.sum(axis=1) >= 2 * p.shape[1]
         variance = _variance(residual, image, shape, used, p.shape[1])
         root = np.where(used, 1 / np.sqrt(variance), 0.0)
@@ -334,7 +334,7 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         p[running] = after
         if ready.any():
             fits = _fits(model, Windows(disc, values[ready]), after[ready],
-                         (image[ready], shape[ready], residual[ready], variance[ready]),
+                         (shape[ready], residual[ready], variance[ready], spread[ready]),
                          (normal[ready], scale[ready]))
             for index, fit in zip(running[ready], fits, strict=True):
                 found[index] = fit
@@ -346,34 +346,38 @@ def _fits(model: MarkModel, windows: Windows, p: np.ndarray,
           modelled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
           normal_and_scale: tuple[np.ndarray, np.ndarray]) -> list[Fit | None]:
     """Return the fits of marks that have settled; None where the uncertainty is not known."""
-    image, shape, residual, variance = modelled
+    shape, residual, variance, spread = modelled
     normal, scale = normal_and_scale
     variances = np.diagonal(_each(np.linalg.inv, normal), axis1=1, axis2=2)[:, :2]
     sigmas = np.sqrt(variances) / scale[:, :2]
     away = windows.values - windows.values.mean(axis=1, keepdims=True)
     explained = 1 - _dot(residual, residual) / np.maximum(_dot(away, away), 1e-300)
     noise = np.sqrt(row_medians(variance)[:, 0])
-    stains = _stains(windows, image, shape, p)
+    stains = _stains(windows, (shape, residual, spread), p)
     return [Fit(p[i, :2], tuple(sigmas[i].tolist()),
                 dict(zip(model.names, p[i, 6:].tolist(), strict=True)), float(p[i, 3]),
                 float(noise[i]), float(explained[i]), *stains[i].tolist())
             if np.isfinite(sigmas[i]).all() else None for i in range(len(p))]
 
 
-def _stains(windows: Windows, image: np.ndarray, shape: np.ndarray, p: np.ndarray) -> np.ndarray:
+def _stains(windows: Windows, modelled: tuple[np.ndarray, np.ndarray, np.ndarray],
+            p: np.ndarray) -> np.ndarray:
     """Count stained pixels in the residuals averaged over 3 x 3 pixels, by their kind (marks, 4).
 
     The order is that of `Fit`: bright, dark, inner, outer.
     """
-    disc, values = windows.disc, windows.values
-    residual = values - image
+    disc, (shape, residual, spread) = windows.disc, modelled
     squares = np.zeros((len(p), *disc.inside.shape))
     squares[:, disc.inside] = residual
     mean = ndimage.uniform_filter(squares, (0, 3, 3), mode="constant")[:, disc.inside] / disc.near
-    spread = MAD * row_medians(np.abs(residual))[:, 0]
-    noise = spread[:, None] / np.sqrt(9 * disc.near)
+    noise = spread / np.sqrt(9 * disc.near)
     least = STAIN * np.abs(p[:, 3:4])
     stained = (np.abs(mean) > np.maximum(least, STAIN_SIGMAS * noise)) & (np.abs(residual) > least)
+
+    found = np.zeros((len(p), 4), dtype=int)
+    some = stained.any(axis=1)  # the levels of the others are not wanted
+    p, values, shape, mean, stained = (
+        each[some] for each in (p, windows.values, shape, mean, stained))
     levels = np.stack([_median_of_part(values, shape < CLEAR, p[:, 2]),
                        _median_of_part(values, shape > 1 - CLEAR, p[:, 2] + p[:, 3])])
     low, high = levels.min(axis=0)[:, None], levels.max(axis=0)[:, None]
@@ -381,8 +385,9 @@ def _stains(windows: Windows, image: np.ndarray, shape: np.ndarray, p: np.ndarra
     bright = stained & (mean > 0) & (values > high + beyond)
     dark = stained & (mean < 0) & (values < low - beyond)
     other, inner = stained & ~bright & ~dark, shape > 0.5
-    return np.stack([part.sum(axis=1) for part in (bright, dark, other & inner, other & ~inner)],
-                    axis=1)
+    found[some] = np.stack([part.sum(axis=1) for part in (
+        bright, dark, other & inner, other & ~inner)], axis=1)
+    return found
 
 
 def _median_of_part(values: np.ndarray, part: np.ndarray, level: np.ndarray) -> np.ndarray:
