@@ -13,7 +13,7 @@ from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.export import origin_lines
-from selfcal_ros.controllers.gcode import Rewriter, commented, corrected_program
+from selfcal_ros.controllers.gcode import OF_SAMPLES, Rewriter, commented, corrected_program
 from selfcal_ros.controllers.gcode_codes import DIALECTS
 from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
 from selfcal_ros.errors import InputError
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def step_of(error_map: ErrorMap, tolerance_m: float) -> float:
-    """Return the distance of points between which a bend of the map is an eighth of a tolerance.
+    """Return the distance of points between which the map bends by OF_SAMPLES of a tolerance.
 
     Where cells meet, the slope of the interpolated map changes by its second difference over the
     pitch. A line between points h apart is off that bend by at most a quarter of the change times
@@ -49,7 +49,7 @@ def step_of(error_map: ErrorMap, tolerance_m: float) -> float:
     bend_m = max(float(np.nanmax(np.abs(np.diff(part, 2, axis)), initial=0.0))
                  for part in (error_map.gx, error_map.gy) for axis in (0, 1))
     pitch_m = error_map.artifact.grid_pitch_m
-    share = tolerance_m / 8 * 4 / (2 * math.sqrt(2) * max(bend_m, 1e-12))
+    share = OF_SAMPLES * tolerance_m * 4 / (2 * math.sqrt(2) * max(bend_m, 1e-12))
     return pitch_m * min(1 / 32, share)
 
 
