@@ -106,7 +106,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
               if test.contradicted and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
     found.bounded &= not any(_beyond_u(solved, test) for test in tests)
-    plausible = all(test.allowed <= block_of(test.name).plausible for test in tests)
+    plausible = all(map(_is_plausible, tests))
     between = any(block_of(name).between for name in raised)
     alike = between and _as_a_microscope(found, measurements, options)
     found.causes[:0] = [cause for cause in raised.values() if cause is not None]
@@ -304,6 +304,11 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
     return True
 
 
+def _is_plausible(test: SizeTest) -> bool:
+    """Return whether a machine may have a term of the size that the readings allow."""
+    return test.allowed <= block_of(test.name).plausible
+
+
 def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     """Return a contradicted size of a term as a cause; None if it does not matter.
 
@@ -317,7 +322,7 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
     held = fitted_term(solved.joint, term.name, test.p,
                    whole=little or test.rank == len(term.estimates))
-    if not _counts(held, solved) and test.allowed <= block_of(test.name).plausible:
+    if not _counts(held, solved) and _is_plausible(test):
         return None
     if block_of(test.name).between and abs(
             (cause := cause_of(held, solved.joint.problem.ground)).size) > BEYOND * cause.u:
