@@ -15,11 +15,11 @@ from selfcal_ros.batch import folder
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
-from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model import result as results
 from selfcal_ros.model.verdict import finding_to_dict
 from selfcal_ros.outputs import plain, write_json
+from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
@@ -73,8 +73,8 @@ def solved(job: folder.Job, source: dict[str, str],
     options = solver_options(settings.solver, session.measurements)
     problem = None
     try:
-        result = worded(with_places(calibrate(session.measurements, options),
-                                    session.measurements.views))
+        found = calibrate_by(settings.solver.method, session.measurements, options)
+        result = worded(with_places(found, session.measurements.views))
     except NotIdentifiableError as error:
         if not isinstance(error.observability, results.Observability):
             raise

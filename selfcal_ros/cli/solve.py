@@ -31,7 +31,6 @@ from selfcal_ros.collection.settings.nodes import (
     SolverSettings,
 )
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.quality.outliers import clean
@@ -46,6 +45,7 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
+from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.phrases import recheck_lines
 from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
@@ -190,7 +190,7 @@ def run(args: argparse.Namespace) -> int:
                          "view has nothing to check its readings against", "omit it")
     try:
         with busy("solving"):
-            result = _calibrated(args, measurements, options)
+            result = _calibrated(args, measurements, options, method=solver.method)
     except NotIdentifiableError as error:
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
@@ -229,10 +229,11 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
     return replace(measurements, artifact=with_nodes(measurements.artifact, args.map, "--map"))
 
 
-def _calibrated(args: argparse.Namespace, measurements: Any, options: Any) -> Any:
+def _calibrated(args: argparse.Namespace, measurements: Any, options: Any, *,
+                method: str) -> Any:
     """Return the result without sentences; errors of offsets or plate name the bag."""
     try:
-        return calibrate(measurements, options)
+        return calibrate_by(method, measurements, options)
     except (WiringError, PlacingError) as error:
         raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
 

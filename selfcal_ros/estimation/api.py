@@ -31,7 +31,6 @@ from selfcal_ros.estimation.joint.camera import (
 )
 from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
-from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import KnownPlate, known_plate
@@ -58,7 +57,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     measurements : Measurements
         All readings, in any order within a view.
     options : Options, optional
-        Method, datum, reference length, model, known plate.
+        Datum, reference length, model, known plate.
 
     Returns
     -------
@@ -82,9 +81,6 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if options.robust:
         return robust_calibrate(measurements, options)
     check_wiring(measurements)
-    if options.method == "law" and measurements.has_images:  # their common noise is not in its U
-        raise InputError("method law", "Hu's law cannot use images of several marks",
-                         "solve with --method joint")
     if options.plate is not None:
         plate = known_plate(options.plate, options.plate_from, options.plate_at)
         return recheck(_as_calibrated(measurements, plate), options, plate)
@@ -94,22 +90,27 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         known = microscope_term(float(scale), float(turn), float(other.max()))
         options = replace(options, assumed=tuple(
             known if term.block.of_offsets else term for term in options.assumed))
-    solved = (solve_law if options.method == "law" else solve_joint)(measurements, options)
-    joint, converged = options.method == "joint", solved.converged
-    if joint and not converged:  # first: with a wrong wiring the search for causes takes seconds
+    solved = solve_joint(measurements, options)
+    converged = solved.converged
+    if not converged:  # first: with a wrong wiring the search for causes takes seconds
         _check_turned(measurements, options, contradicted=True)
     solved = judged(solved, measurements, options)
     result = solved.result
-    if joint and converged and not _agree(result):
+    if converged and not _agree(result):
         _check_turned(measurements, options, contradicted=not _fits(result))
-    if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
-        check_placing(measurements)  # without repeats residuals are the noise: no contradiction
+    require_placed(result, measurements)
     if not measurements.has_images:
         return result
     return replace(
         result, findings=(*result.findings, *few_read(measurements, camera)),
         camera=None if camera is None else camera.shown,
-        stage_yaw=None if solved.model is None else yaw_of(solved.model, measurements.sense))
+        stage_yaw=yaw_of(solved.joint, measurements.sense))
+
+
+def require_placed(result: CalibrationResult, measurements: Measurements) -> None:
+    """Raise PlacingError if a result is not good because the plate is not placed as planned."""
+    if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
+        check_placing(measurements)  # without repeats residuals are the noise: no contradiction
 
 
 def calibrate_corrected(measurements: Measurements, options: Options) -> CalibrationResult:
@@ -201,7 +202,7 @@ def robust_calibrate(measurements: Measurements,
     measurements : Measurements
         All readings.
     options : Options, optional
-        As for `calibrate`; the method must be ``joint``.
+        As for `calibrate`.
 
     Returns
     -------
@@ -214,7 +215,7 @@ def robust_calibrate(measurements: Measurements,
     Raises
     ------
     InputError
-        For Hu's law, which needs every reading, and for a known plate.
+        For a known plate.
     NotIdentifiableError
         As `calibrate`.
     """
@@ -248,7 +249,7 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
 def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
     """Return the camera shown by images of several marks, and the readings corrected for it."""
     straight, camera = measurements, None
-    if options.method == "law" or not measurements.has_images:
+    if not measurements.has_images:
         return None, measurements
     plain = replace(options, terms=(), assumed=tuple(
         term for term in options.model_terms(visits=True) if term.block.of_images))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How to calibrate: method, datum, reference length, model of the misalignments."""
+"""How to calibrate: datum, reference length, model of the misalignments."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,6 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, default_terms
 
-METHODS = ("joint", "law")
 MISALIGNMENT_MODELS = ("linear", "rigid")
 MAX_EXPANSION_PER_K = 1e-3
 """Coefficient of linear expansion above that of any solid, 1/K."""
@@ -173,15 +172,12 @@ class Options:
 
     Attributes
     ----------
-    method : str
-        ``joint`` (all readings in one least squares) or ``law`` (Hu's published steps).
     datum_theta : ThetaDatum
         Condition that fixes the constant of the angular map.
     reference : ReferenceLength, optional
         Sets the scale; without it the map has none (Hu eq. 5).
     misalignment_model : str
-        ``rigid``: finite rotations of the plate, or ``linear``, as published. Empty = rigid, or
-        linear for the law, which has no other model.
+        ``rigid``: finite rotations of the plate, or ``linear``, as published.
     uncertainty : bool, optional
         Whether to compute the uncertainty map; None decides by the size of the field.
     terms : tuple of ModelTerm
@@ -214,13 +210,12 @@ class Options:
     Raises
     ------
     InputError
-        For an unknown method or model, or if robust does not fit the others.
+        For an unknown model or datum, or if robust does not fit the others.
     """
 
-    method: str = "joint"
     datum_theta: ThetaDatum = ThetaDatum.ZERO_MEAN
     reference: ReferenceLength | None = None
-    misalignment_model: str = ""
+    misalignment_model: str = "rigid"
     uncertainty: bool | None = None
     terms: tuple[ModelTerm, ...] = ()
     drift_degree: int = DRIFT_DEGREE
@@ -235,22 +230,15 @@ class Options:
     plate_at: str = ""
 
     def __post_init__(self) -> None:
-        """Fill in the model of the method; refuse unknown names."""
-        if not self.misalignment_model:
-            object.__setattr__(self, "misalignment_model",
-                               "linear" if self.method == "law" else "rigid")
-        for name, known in (("method", METHODS), ("misalignment_model", MISALIGNMENT_MODELS)):
-            if getattr(self, name) not in known:
-                raise InputError(name, f"'{getattr(self, name)}' is unknown",
-                                 known_are(str(getattr(self, name)), known))
+        """Refuse unknown names."""
+        if self.misalignment_model not in MISALIGNMENT_MODELS:
+            raise InputError("misalignment_model", f"'{self.misalignment_model}' is unknown",
+                             known_are(self.misalignment_model, MISALIGNMENT_MODELS))
         try:
             object.__setattr__(self, "datum_theta", ThetaDatum(self.datum_theta))
         except ValueError as error:
             raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
                              known_are(str(self.datum_theta), ThetaDatum)) from error
-        if self.robust and self.method == "law":
-            raise InputError("robust", "Hu's law needs every reading and cannot leave any out",
-                             "solve with --method joint")
         if self.robust and self.plate is not None:
             raise InputError("robust", f"the plate is known from {self.plate_from}, and one view "
                              "has nothing to check its readings against", "omit it")

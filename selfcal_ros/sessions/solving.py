@@ -20,6 +20,7 @@ from selfcal_ros.model import result as results
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
 from selfcal_ros.outputs import write_json
+from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
@@ -40,6 +41,7 @@ class Job:
     run: Run
     measurements: Measurements
     options: Options
+    method: str
     digest: str
     stamp_ns: int
     notes: tuple[str, ...] = ()
@@ -60,7 +62,8 @@ def solve(job: Job) -> Outcome:
     try:
         if job.measurements.verify:
             return Outcome(job, _verified(job), None)
-        return Outcome(job, _finished(job, calibrate(job.measurements, job.options)), None)
+        found = calibrate_by(job.method, job.measurements, job.options)
+        return Outcome(job, _finished(job, found), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
         return Outcome(job, _finished(job, result), error)
@@ -267,7 +270,8 @@ class SolvingSession:
             self.shown = Shown(None, error, self._run, self._views_done, stamp)
             self._publish_summary()
             raise
-        return Job(self._run, measurements, options, digest, stamp, self._notes, self._views_done)
+        return Job(self._run, measurements, options, self._settings.method, digest,
+                   stamp_ns=stamp, notes=self._notes, views_done=self._views_done)
 
     def _verifies_later(self) -> bool:
         """Return whether views of a verification are to come: one says less than all."""

@@ -159,8 +159,7 @@ def test_the_estimator_gets_what_the_solver_was_given():
     settings = SolverSettings.checked({"theta_datum": "xy_axes",
                                        "misalignment_model": "linear"}, "here")
     options = solver_options(settings)
-    assert (options.method, options.datum_theta, options.misalignment_model) == (
-        "joint", ThetaDatum.XY_AXES, "linear")
+    assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.XY_AXES, "linear")
     assert options.uncertainty is None
 
 
@@ -168,8 +167,12 @@ def test_without_being_told_plates_turn_and_the_encoder_owes_nothing_to_the_axes
     options = solver_options(SolverSettings.checked({}, "here"))
     assert options == Options()
     assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.ZERO_MEAN, "rigid")
-    law = solver_options(SolverSettings.checked({"method": "law"}, "here"))
-    assert (law.method, law.misalignment_model) == ("law", "linear")
+
+
+def test_the_law_cannot_use_a_known_plate():
+    with pytest.raises(InputError, match=r"method law: the plate is known from r.json, and .*leave "
+                                         "the method out"):
+        solver_options(SolverSettings.checked({"method": "law"}, "here"), plate_from="r.json")
 
 
 def asked(*terms: str) -> Measurements:

@@ -17,6 +17,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
+from selfcal_ros.papers.methods import calibrate_by_law
 from test.support.options import BARE, bare
 from test.support.truth import Spread, random_truth, simulate_measurements
 
@@ -94,6 +95,6 @@ def test_what_needs_lines_on_both_axes_is_refused():
     with pytest.raises(InputError, match="xy_axes: of 10 lines, none lies on the y axis"):
         calibrate(readings, bare(datum_theta=ThetaDatum.XY_AXES))
     with pytest.raises(InputError, match=r"Hu's law needs a square plate with 4, 8, 12"):
-        calibrate(readings, Options(method="law"))
+        calibrate_by_law(readings, Options())
     with pytest.raises(InputError, match="encoder xy_axes: of 10 lines, none"):
         random_truth(readings.artifact, 4, np.random.default_rng(1), Spread(encoder="xy_axes"))

@@ -12,6 +12,7 @@ from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.papers.methods import calibrate_by, calibrate_by_law
 from test.support.collecting import collect, scene
 from test.support.dense_lattice import solve
 from test.support.plans import image_plan, plan_of
@@ -125,11 +126,11 @@ def test_no_site_lies_on_an_axis():
     """The theta datum of the half axes and Hu's law with it are refused, zero_mean is not."""
     plan = plan_of("0, 90, tx", 4, count=8, line=True)
     truth, readings = measured(plan, 5, sigma_m=0.0)
-    for how in ({}, {"method": "law", "misalignment_model": "linear"}):
+    for method in ("joint", "law"):
         with pytest.raises(InputError, match=r"on the axes.*zero_mean"):
-            calibrate(readings, Options(datum_theta=ThetaDatum.XY_AXES, **how))
+            calibrate_by(method, readings, Options(datum_theta=ThetaDatum.XY_AXES))
     _, linear = measured(plan, 5, sigma_m=0.0, linear=True)
-    found = calibrate(linear, Options(method="law", misalignment_model="linear"))
+    found = calibrate_by_law(linear, Options())
     assert np.abs([found.error_map.gx - truth.g[0], found.error_map.gy - truth.g[1]]).max() < 1e-14
 
 

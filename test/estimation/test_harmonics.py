@@ -28,6 +28,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Grade
+from selfcal_ros.papers.methods import calibrate_by_law
 from selfcal_ros.reporting.figures.drawing import Path
 from selfcal_ros.reporting.figures.maps import CENTRE, angular_map
 from selfcal_ros.reporting.words.findings import worded
@@ -292,7 +293,7 @@ def test_the_axes_fix_the_constant_of_a_series_too():
         series, result.error_map.g_theta, rcond=None)[0]
     assert np.abs(rest).max() < 1e-15
     with pytest.raises(InputError, match="Hu's law needs"):
-        calibrate(readings, Options(method="law"))
+        calibrate_by_law(readings, Options())
 
 
 def test_a_recheck_of_a_known_plate_finds_the_series():

@@ -111,12 +111,14 @@ def solver_options(settings: SolverSettings, measurements: Measurements | None =
     """
     if measurements is not None:
         plate_from = plate_from or measurements.verify or measurements.artifact_from
+    if plate_from and settings.method == "law":
+        raise InputError("method law", f"the plate is known from {plate_from}, and Hu's law cannot "
+                         "use that", "leave the method out")
     reference = _reference(settings, measurements)
     terms, origin = _terms(settings.model_terms, measurements)
     assumed = _assumed(settings)
-    return Options(method=settings.method, datum_theta=ThetaDatum(settings.theta_datum),
-                   misalignment_model="" if settings.method == "law" else
-                   settings.misalignment_model, reference=reference,
+    return Options(datum_theta=ThetaDatum(settings.theta_datum),
+                   misalignment_model=settings.misalignment_model, reference=reference,
                    uncertainty=UNCERTAINTY[settings.uncertainty],
                    terms=terms, terms_from=origin if terms else "", assumed=assumed,
                    drift_degree=settings.drift_degree, plate_from=plate_from,

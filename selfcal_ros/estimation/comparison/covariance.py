@@ -51,9 +51,9 @@ MAX_LINES = 1024
 MAX_STORED = 2 * 21 * 21
 """Largest number of coordinates whose covariance is stored: 3.5 MB."""
 COVARIANCE = "map_covariance"
-"""Key of the covariance of a mean map, of a recheck, or of Hu's law: lower triangles over Gx, then
-Gy, of the known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and
-`scale_theta` (rad^2)."""
+"""Key of the covariance of a mean map or of a recheck: lower triangles over Gx, then Gy, of the
+known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta`
+(rad^2)."""
 
 
 def covariance_of(result: CalibrationResult, kind: str, known: np.ndarray, *,
@@ -472,9 +472,8 @@ def behind(result: CalibrationResult) -> Together | None:
 
 def together(result: CalibrationResult) -> Together | None:
     """Return the joint covariance of stage and plate of a result; None if it is incomplete."""
-    if result.method != "joint" or (
-            result.model.terms and BESIDE not in result.extra.get(KEY, {})) \
-            or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
+    incomplete = result.model.terms and BESIDE not in result.extra.get(KEY, {})
+    if incomplete or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
         return None
     found = behind(result)
     return found if found is not None and found.marks.any() else None

@@ -86,7 +86,7 @@ class Solved:
     xy, theta : NoiseEstimate
         Noise of the grid and of the angular readings.
     model : ModelFit, optional
-        The joint fit; None for Hu's law.
+        The joint fit; None if the map was made by other steps.
     axes : tuple of float
         Probability and size (rad) of the misclosure of the axis conditions; 1 and 0 if not
         used.
@@ -108,7 +108,7 @@ class Solved:
         Raises
         ------
         ValueError
-            For Hu's law.
+            For a map that was made by other steps.
         """
         if self.model is None:
             raise ValueError("the solution has no joint fit")
@@ -489,7 +489,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         views_of(measurements, problem, np.where(
             problem.system.known_views, found.parameters, np.nan)), seen,
         noise_of(found.xy, found.theta),
-        measurements.all_rejected(), findings=findings, method="joint",
+        measurements.all_rejected(), findings=findings,
         sense=str(measurements.sense),
         extra={**kept, **_kept_images(measurements, model),
                **kept_residuals(measurements, model)},

@@ -15,10 +15,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.covariance import kept_covariance
 from selfcal_ros.estimation.joint.problem import FLOOR, NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.solve import Solved, noise_of
-from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, half_axis_slopes
@@ -230,7 +228,6 @@ _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, 
           "one pitch along +X with grid and lines")
 
 
-@one_thread()
 def solve_law(measurements: Measurements, options: Options) -> Solved:
     """Calibrate by Hu's law from exactly Hu's four views, all complete.
 
@@ -244,14 +241,14 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     Returns
     -------
     Solved
-        Its result has the `method` "law". Uncertainties are propagated linearly through every step.
+        Its result has the `method` "law". Uncertainties are propagated linearly through every step;
+        correlations are not kept.
 
     Raises
     ------
     InputError
-        If a view is missing, surplus or incomplete, or an option does not apply to the law.
+        If a view is missing, surplus or incomplete, or the datum does not exist.
     """
-    _require_plain(options)
     views = hu_views(measurements)
     order = [next(i for i, v in enumerate(measurements.views) if v is view) for view in views]
     law = law_for(measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense)
@@ -280,20 +277,8 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
         noise,
         measurements.all_rejected(), findings=_findings(artifact, options), method="law",
-        sense=str(sense), run_id=measurements.run_id,
-        extra={} if options.uncertainty is False else kept_covariance(
-            spread.covariances(noise, sense)))
+        sense=str(sense), run_id=measurements.run_id)
     return Solved(result, xy, theta)
-
-
-def _require_plain(options: Options) -> None:
-    if options.reference is not None:
-        raise InputError("method law", "Hu's law has no reference length", _JOINT)
-    if options.terms:
-        raise InputError("method law", "Hu's law has no terms besides stage and plate", _JOINT)
-    if options.misalignment_model != "linear":
-        raise InputError("method law", f"Hu's law is linear, not {options.misalignment_model}",
-                         _JOINT)
 
 
 @lru_cache(4)
@@ -384,41 +369,21 @@ def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
 class _Spread:
     """Effect of unit noise of every reading, of grid and of angular readings.
 
-    `found`: what the law makes of each column of noise, of one kind and the other; `exact`:
-    whether there is a column for each reading, or random ones; `rest`, `rest_dof` (2,): the
-    expected sums of squared residuals, of grid readings in XY and angular ones in theta, and their
-    effective degrees of freedom.
+    `var_g` (2, 2, N, N), `var_theta` (2, K): variances that noise of one kind and the other makes;
+    `rest`, `rest_dof` (2,): the expected sums of squared residuals, of grid readings in XY and
+    angular ones in theta, and their effective degrees of freedom.
     """
 
-    found: tuple[HuSolution, HuSolution]
-    exact: bool
+    var_g: np.ndarray
+    var_theta: np.ndarray
     rest: np.ndarray
     rest_dof: np.ndarray
 
     def uncertainty(self, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
         """Return the standard uncertainties of g (2, N, N) and g_theta (K,)."""
-        columns = 1.0 if self.exact else N_DRAWS
-        return (np.sqrt(self._summed(noise, lambda of: (of.g**2).sum(axis=-1)) / columns),
-                np.sqrt(self._summed(noise, lambda of: (of.g_theta**2).sum(axis=-1)) / columns))
-
-    def covariances(self, noise: Noise, sense: Sense) -> dict[str, np.ndarray]:
-        """Return the covariances of both maps, stage frame, m^2 and rad^2; none from draws."""
-        if not self.exact or not np.isfinite([noise.sigma_xy, noise.sigma_theta]).all():
-            return {}
-
-        def square(columns: np.ndarray) -> np.ndarray:
-            flat = columns.reshape(-1, columns.shape[-1])
-            return flat @ flat.T
-
-        return {"xy": self._summed(noise, lambda of: square(_to_stage(
-                    sense, of.g, of.g_theta)[0])),
-                "theta": self._summed(noise, lambda of: square(_to_stage(
-                    sense, of.g, of.g_theta)[1]))}
-
-    def _summed(self, noise: Noise, of: Callable[[HuSolution], np.ndarray]) -> np.ndarray:
-        """Return the sum over both kinds of readings of squares, times the variance of each."""
-        grid, lines = map(of, self.found)
-        return noise.sigma_xy**2 * grid + noise.sigma_theta**2 * lines
+        power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
+        return (np.sqrt(np.tensordot(power, self.var_g, axes=1)),
+                np.sqrt(np.tensordot(power, self.var_theta, axes=1)))
 
 
 def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
@@ -428,7 +393,10 @@ def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
                    for kind in range(2))
     rest, dof = np.transpose([_quadratic_form(each, exact=exact)
                               for each in (grid.rest_xy, lines.rest_theta)])
-    return _Spread((grid, lines), exact, rest, dof)
+    columns = 1 if exact else N_DRAWS
+    var_g, var_theta = (np.stack([(values**2).sum(axis=-1) / columns for values in each]) for each
+                        in ((grid.g, lines.g), (grid.g_theta, lines.g_theta)))
+    return _Spread(var_g, var_theta, rest, dof)
 
 
 def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:

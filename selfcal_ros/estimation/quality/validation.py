@@ -371,7 +371,7 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
     measurements : Measurements
         All readings.
     options : Options
-        As for `calibrate`; uncertainties are not computed, the method is ``joint``.
+        As for `calibrate`; uncertainties are not computed.
     folds : int
         Number of random tenths, at most 10; they do not overlap.
 
@@ -381,7 +381,7 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
         As `calibrate`, for all readings.
     """
     # a pure datum: half axes that lose a mark would not do for xy_axes
-    options = replace(options, method="joint", uncertainty=False, causes=False,
+    options = replace(options, uncertainty=False, causes=False,
                       datum_theta=ThetaDatum.ZERO_MEAN)
     fit_joint(measurements, options)  # refuses what cannot be solved as a whole
     rng = np.random.default_rng(0)

@@ -129,9 +129,9 @@ class Rechecked:
 
 def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
     """Return the parts from which `recheck` assembles its result."""
-    if options.method != "joint" or options.reference is not None:
-        raise InputError("options", "a recheck always uses the method joint and the reference "
-                         "length of the plate's calibration", "leave both out")
+    if options.reference is not None:
+        raise InputError("options", "a recheck always uses the reference length of the plate's "
+                         "calibration", "leave it out")
     readings = plate_readings(on_plate(measurements, plate), options, plate)
     xy, theta = _noise(readings, plate)
     new, solution = _new_map(readings, plate, xy, options)

@@ -184,8 +184,9 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
                failed: bool) -> Solved:
     """Return the solution in which causes are searched for: joint, and rigid if that fits better.
 
-    Hu's law has no residuals of all readings, and a linear model mistakes rotations for other
-    effects. `solved` itself if no search is wanted, or there is no other solution.
+    A solution by other steps has no residuals of all readings, and a linear model mistakes
+    rotations for other effects. `solved` itself if no search is wanted, or there is no other
+    solution.
     """
     nx, ny = measurements.artifact.shape
     wanted = failed or nx * ny <= ALWAYS_SITES
@@ -193,10 +194,8 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
         return solved
     try:
         linear = solved if solved.model is not None else solve_joint(
-            measurements, replace(options, method="joint", misalignment_model="linear",
-                                  at_places=False))  # as the law has them
-        rigid = solve_joint(
-            measurements, replace(options, method="joint", misalignment_model="rigid"))
+            measurements, replace(options, at_places=False))
+        rigid = solve_joint(measurements, replace(options, misalignment_model="rigid"))
     except InputError:
         return solved
     return rigid if SAME * rigid.xy.residuals < linear.xy.residuals else linear
@@ -284,8 +283,7 @@ def _scale_findings(solved: Solved, measurements: Measurements, options: Options
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
     """Return the fit with finite rotations: a linear model has no microscope."""
     try:
-        return fit_joint(measurements, replace(options, method="joint",
-                                               misalignment_model="rigid"))
+        return fit_joint(measurements, replace(options, misalignment_model="rigid"))
     except InputError:
         return None
 

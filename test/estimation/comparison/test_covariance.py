@@ -14,7 +14,6 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
 )
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.law.solve import hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
@@ -26,7 +25,7 @@ from test.support.lattice_plans import plan_of
 from test.support.map_covariance import map_covariance
 from test.support.options import BARE, bare, reference_length
 from test.support.recalibrations import responses, sizes_of
-from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
+from test.support.truth import hu_plan, random_truth, simulate_measurements
 
 PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
 TURNED = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(5, 0.01, 12), lines=1)
@@ -169,33 +168,3 @@ def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(datum
     answers = responses(lambda moved: map_of(calibrate(moved, quick)), readings,
                         sizes_of(readings, 2e-8, 2e-5))
     require_covariances(calibrate(readings, options), answers, theta=theta)
-
-
-@pytest.mark.parametrize("sense", Sense)
-def test_maps_of_the_law_have_the_covariance_of_their_readings(sense):
-    how = {"sense": sense, "linear": True, "spread": Spread(encoder="xy_axes")}
-    readings = stated(measured(SMALL, 1, **how))
-    options = bare(method="law", datum_theta="xy_axes", causes=False)
-    result = calibrate(readings, options)
-    law = law_for(readings.artifact, result.error_map.datum_theta, sense)
-
-    def solve(moved):
-        found = law.solve(hu_readings(moved.artifact, hu_views(moved)))
-        g, theta = found.g[..., 0], found.g_theta[:, 0]
-        if sense is Sense.PLATE_MOVES:  # the law solves for H(X) = -G(-X)
-            g, theta = -g[:, ::-1, ::-1], -theta[-np.arange(len(theta))]
-        return np.concatenate([g.ravel(), theta])
-
-    np.testing.assert_allclose(solve(readings), map_of(result), rtol=0, atol=1e-18)
-    sizes = sizes_of(readings, 2e-8, 2e-5)
-    require_covariances(result, responses(solve, readings, sizes))
-
-    def first_order(moved):
-        emap = calibrate(moved, replace(options, uncertainty=False)).error_map
-        return np.array([emap.nonorthogonality, emap.scale_difference])
-
-    moved = responses(first_order, readings, sizes)
-    assert first_order_u(result) == pytest.approx(np.sqrt((moved**2).sum(axis=0)), rel=1e-4)
-    test = compare(result, calibrate(measured(SMALL, 2, **how), options))
-    assert test.xy.correlated and test.theta.correlated
-    assert min(test.xy.p, test.theta.p) > 0.01

@@ -81,7 +81,6 @@ def test_what_is_not_kept_is_not_known():
     kept = dict(result.extra[KEY])
     del kept["beside"]
     assert together(replace(result, extra={**result.extra, KEY: kept})) is None
-    assert together(replace(result, method="law")) is None
     assert together(replace(result, views=tuple(
         replace(view, read_grid=None) for view in result.views))) is None
     damaged = {**result.extra[KEY], "beside": {"with_map": 1, "plate": [1.0, 2.0]}}

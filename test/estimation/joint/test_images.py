@@ -20,6 +20,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
+from selfcal_ros.papers.methods import calibrate_by_law
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.options import STILL
@@ -294,7 +295,7 @@ def test_hus_law_refuses_images():
     _, measurements = measured(MARK, 1, size=5)
     with pytest.raises(InputError, match="Hu's law cannot use images of several marks; "
                                          "solve with --method"):
-        calibrate(measurements, Options(method="law"))
+        calibrate_by_law(measurements, Options())
 
 
 def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():

@@ -7,18 +7,20 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.law.solve import _quadratic_form, hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Finding
+from selfcal_ros.papers.methods import calibrate_by_law
 from test.support.recalibrations import responses, sizes_of
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
-LAW = Options(method="law", datum_theta="xy_axes")
+LAW = Options(datum_theta="xy_axes")
 AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
@@ -38,7 +40,7 @@ CASES = [(5, 8, datum, sense) for datum in ThetaDatum for sense in Sense]
     (15, 36, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)])
 def test_noise_free_readings_give_the_truth_back(size, count, datum, sense):
     truth, readings = measured(size, count, sense=sense)
-    result = calibrate(readings, replace(LAW, datum_theta=datum))
+    result = calibrate_by_law(readings, replace(LAW, datum_theta=datum))
     emap, amap = result.error_map, result.artifact_map
     assert np.abs(np.stack([emap.gx, emap.gy]) - truth.g).max() < 1e-12 * 30e-6
     assert np.abs(np.stack([amap.ax, amap.ay]) - truth.a).max() < 1e-12 * 30e-6
@@ -57,7 +59,7 @@ def test_noise_free_readings_give_the_truth_back(size, count, datum, sense):
 
 def test_first_order_parts_are_reported():
     _, readings = measured(11, 24)
-    emap = calibrate(readings, LAW).error_map
+    emap = calibrate_by_law(readings, LAW).error_map
     x, y = emap.artifact.x_m, emap.artifact.y_m
     d = (x**2 + y**2).sum()
     assert emap.nonorthogonality == pytest.approx((emap.gx * y + emap.gy * x).sum() / d, rel=1e-9)
@@ -108,7 +110,7 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(sense):
     u_g, u_theta = spread[:50].reshape(2, 5, 5), spread[50:]
     if sense is Sense.PLATE_MOVES:  # the law solves for H(X) = -G(-X)
         u_g, u_theta = u_g[:, ::-1, ::-1], u_theta[-np.arange(8)]
-    emap = calibrate(readings, LAW).error_map
+    emap = calibrate_by_law(readings, LAW).error_map
     np.testing.assert_allclose([emap.u_gx, emap.u_gy], u_g, rtol=1e-8)
     np.testing.assert_allclose(emap.u_g_theta, u_theta, rtol=1e-8)
 
@@ -121,9 +123,9 @@ def _known_noise(readings, sigma_m, sigma_rad):
 
 def test_exact_and_drawn_propagation_agree(monkeypatch):
     _, readings = measured(11, 24, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    exact = calibrate(readings, LAW)
+    exact = calibrate_by_law(readings, LAW)
     monkeypatch.setattr("selfcal_ros.estimation.law.solve.EXACT_SIZE", 9)
-    drawn = calibrate(readings, LAW)
+    drawn = calibrate_by_law(readings, LAW)
     for name in ("u_gx", "u_gy", "u_g_theta"):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
         assert abs(np.sqrt((ratio**2).mean()) - 1) < 0.1
@@ -136,13 +138,13 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
 def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_size):
     monkeypatch.setattr("selfcal_ros.estimation.law.solve.EXACT_SIZE", exact_size)
     _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    wanted, plain = (calibrate(readings, replace(LAW, uncertainty=uncertainty)).error_map
+    wanted, plain = (calibrate_by_law(readings, replace(LAW, uncertainty=uncertainty)).error_map
                      for uncertainty in (None, False))
     for name in ("gx", "gy", "g_theta"):
         assert np.array_equal(getattr(wanted, name), getattr(plain, name))
     for name in ("u_gx", "u_gy", "u_g_theta"):
         assert (getattr(wanted, name) > 0).all() and np.isnan(getattr(plain, name)).all()
-    found = calibrate(readings, replace(LAW, uncertainty=False))
+    found = calibrate_by_law(readings, replace(LAW, uncertainty=False))
     assert not any(finding.name == "drawn_uncertainty" for finding in found.findings)
     assert not found.has_uncertainty
 
@@ -152,7 +154,7 @@ def test_noise_of_one_reading_from_what_is_left_over():
     for seed in range(12):
         _, readings = measured(11, 24, seed=seed, repeats=3, sigma_m=SIGMA_M,
                                sigma_theta_rad=SIGMA_RAD)
-        noise = calibrate(readings, LAW).noise
+        noise = calibrate_by_law(readings, LAW).noise
         assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(SIGMA_M)
         ratios.append((noise.sigma_xy_residuals / SIGMA_M, noise.sigma_theta_residuals / SIGMA_RAD))
     ratios = np.array(ratios)
@@ -173,29 +175,38 @@ def test_noise_of_one_reading_from_what_is_left_over():
 def test_views_that_are_not_hus_are_refused(change, message):
     _, readings = measured()
     with pytest.raises(InputError) as refusal:
-        calibrate(replace(readings, views=change(readings.views)), LAW)
+        calibrate_by_law(replace(readings, views=change(readings.views)), LAW)
     assert message in str(refusal.value) and "--method joint" in str(refusal.value)
 
 
 def test_options_and_plates_that_the_law_does_not_know_are_refused():
     _, readings = measured()
     reference = ReferenceLength(ReferenceKind.ARTIFACT, 1e-6)
-    for options, message in ((replace(LAW, reference=reference), "no reference length"),
-                             (replace(LAW, misalignment_model="rigid"), "linear, not rigid")):
+    for change, message in (({"reference": reference}, "no reference length"),
+                            ({"terms": (ModelTerm("drift"),)}, "no terms besides stage and plate"),
+                            ({"robust": True}, "robust: Hu's law needs every reading"),
+                            ({"plate": calibrate_by_law(readings, LAW)}, "use a known plate")):
         with pytest.raises(InputError, match=message):
-            calibrate(readings, options)
+            calibrate_by_law(readings, replace(LAW, **change))
     with pytest.raises(InputError, match="square plate with 4, 8, 12"):
-        calibrate(replace(readings, artifact=Artifact(5, 0.01, 8, 7)), LAW)
+        calibrate_by_law(replace(readings, artifact=Artifact(5, 0.01, 8, 7)), LAW)
     _, small = measured(3, 4)
     with pytest.raises(InputError, match="has no slope"):
-        calibrate(small, LAW)
-    assert calibrate(small, replace(LAW, datum_theta="zero_mean")).method == "law"
+        calibrate_by_law(small, LAW)
+    assert calibrate_by_law(small, replace(LAW, datum_theta="zero_mean")).method == "law"
+
+
+def test_correlations_are_unknown():
+    _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
+    result = calibrate_by_law(readings, LAW)
+    variances = covariance_of(result, "xy", result.error_map.valid)
+    assert np.array_equal(variances, result.error_map.of("xy")[1].ravel() ** 2)
 
 
 def test_order_of_views_does_not_matter():
     _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    first = calibrate(readings, LAW)
-    second = calibrate(replace(readings, views=readings.views[::-1]), LAW)
+    first = calibrate_by_law(readings, LAW)
+    second = calibrate_by_law(replace(readings, views=readings.views[::-1]), LAW)
     assert np.array_equal(first.error_map.gx, second.error_map.gx)
     assert [v.phi for v in first.views] == [v.phi for v in second.views][::-1]
 

@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import binom
 from scipy.stats import f as f_distribution
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.quality.outliers import clean, noisy_views, residuals_of
 from selfcal_ros.estimation.verdict import leverage
@@ -393,11 +392,6 @@ def test_exact_readings_have_no_outliers():
     views = tuple(replace(v, dtheta=v.dtheta) for v in readings.views)
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
     assert {kind for _, kind, _ in removed(result)} <= {"angular"} and not result.extra["slips"]
-
-
-def test_the_law_is_refused():
-    with pytest.raises(InputError, match="Hu's law needs every reading"):
-        robust_calibrate(measured()[1], bare(method="law"))
 
 
 def test_order_of_readings_does_not_matter():

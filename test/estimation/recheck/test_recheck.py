@@ -18,7 +18,7 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
 )
 from selfcal_ros.estimation.joint import solve
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import _misfit, predict_recheck, recheck
 from selfcal_ros.model.artifact import Artifact
@@ -263,7 +263,7 @@ def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
-    ({"method": "law"}, "does not contain the covariance of its plate"),
+    ({"views": ()}, "does not contain the covariance of its plate"),
     ({"recheck": SimpleNamespace(of="first.json")}, "which does not calibrate a plate; name "
                                                     "the calibration that it used, first.json")])
 def test_results_without_a_known_plate(change, message):
@@ -275,10 +275,8 @@ def test_what_one_view_cannot_tell_is_refused():
     plate, (_, after) = known_plate(calibrated(), "r.json"), sessions()
     with pytest.raises(InputError, match="term 'drift'; give it a size, drift:SIZE"):
         recheck(after, replace(linear(), terms=parse_terms(["drift"], "")), plate)
-    for options in (replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)),
-                    Options(method="law")):
-        with pytest.raises(InputError, match="a recheck always uses the method joint"):
-            recheck(after, options, plate)
+    with pytest.raises(InputError, match="a recheck always uses the reference length of"):
+        recheck(after, replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)), plate)
     nothing = replace(after, views=(replace(after.views[0], m=np.zeros(0, int), n=np.zeros(0, int),
                                             dx=np.zeros(0), dy=np.zeros(0),
                                             count=np.zeros(0, int), visits=None),))

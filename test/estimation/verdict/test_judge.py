@@ -10,7 +10,6 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import search
 from selfcal_ros.estimation.verdict.judge import judged, provenance_of
@@ -48,7 +47,6 @@ def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
 
 
 def test_axis_conditions_that_nobody_asked_for_hold(readings):
-    assert solve_law(readings, Options(method="law")).axes == (1.0, 0.0)
     linear = Options(misalignment_model="linear")
     assert solve_joint(readings, linear).axes == (1.0, 0.0)
 

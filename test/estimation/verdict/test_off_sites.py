@@ -14,6 +14,7 @@ from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewRead
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import View
+from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -213,6 +214,6 @@ def test_the_law_which_takes_the_sites_for_the_places_is_told_so():
     cell = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=1e-6, servo_sigma_m=0.0,
                         servo_sigma_theta_rad=0.0, follow_mark=True)
     made = simulate_measurements(truth, plan, rng, settings=cell)
-    law, joint = (calibrate(made, bare(method=method)) for method in ("law", "joint"))
+    law, joint = (calibrate_by(method, made, bare()) for method in ("law", "joint"))
     assert joint.verdict.qualified and not law.verdict.qualified
     assert "off_sites" in [cause.name for cause in law.verdict.causes]
