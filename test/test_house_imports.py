@@ -11,7 +11,7 @@ from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
 ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
-              "datum", "terms", "observability", "joint", "verdict", "comparison", "law",
+              "datum", "terms", "observability", "joint", "verdict", "comparison",
               "recheck", "quality", "api")
 """The parts of estimation/: each imports only those before it."""
 

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.law.solve import HuReadings, hu_readings, hu_views, law_for
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability.plan_check import predict
@@ -17,6 +16,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.papers.law import HuReadings, hu_readings, hu_views, law_for
 from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.parallel import Progress, mapped_in_parts, silent
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth

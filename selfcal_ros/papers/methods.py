@@ -6,12 +6,12 @@ from dataclasses import replace
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate, require_placed
 from selfcal_ros.estimation.checks.wiring import check_wiring
-from selfcal_ros.estimation.law.solve import solve_law
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.papers.law import solve_law
 
 LAW = "law"
 """Name of Hu's law among the methods."""

@@ -8,13 +8,13 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import covariance_of
-from selfcal_ros.estimation.law.solve import _quadratic_form, hu_readings, hu_views, law_for
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Finding
+from selfcal_ros.papers.law import _quadratic_form, hu_readings, hu_views, law_for
 from selfcal_ros.papers.methods import calibrate_by_law
 from test.support.recalibrations import responses, sizes_of
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
@@ -124,7 +124,7 @@ def _known_noise(readings, sigma_m, sigma_rad):
 def test_exact_and_drawn_propagation_agree(monkeypatch):
     _, readings = measured(11, 24, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
     exact = calibrate_by_law(readings, LAW)
-    monkeypatch.setattr("selfcal_ros.estimation.law.solve.EXACT_SIZE", 9)
+    monkeypatch.setattr("selfcal_ros.papers.law.EXACT_SIZE", 9)
     drawn = calibrate_by_law(readings, LAW)
     for name in ("u_gx", "u_gy", "u_g_theta"):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
@@ -136,7 +136,7 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
 
 @pytest.mark.parametrize("exact_size", [21, 3])
 def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_size):
-    monkeypatch.setattr("selfcal_ros.estimation.law.solve.EXACT_SIZE", exact_size)
+    monkeypatch.setattr("selfcal_ros.papers.law.EXACT_SIZE", exact_size)
     _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
     wanted, plain = (calibrate_by_law(readings, replace(LAW, uncertainty=uncertainty)).error_map
                      for uncertainty in (None, False))

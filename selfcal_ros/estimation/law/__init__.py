@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Hu's published law, applied to the same readings."""
