@@ -9,7 +9,8 @@ Solves every recorded bag by several models, and N (200) random simulated sessio
 effects, noises, faults and options drawn from the number of the session. Every number of each
 RESULT.json is recorded, and the names in it (grade, causes, views). Sentences are left out. A
 comparison ends with exit code 1 where a value differs, in any bit or by more than PART of the
-standard uncertainty of the map (rms); values of one tree alone are counted only. To record another
+standard uncertainty of the map (rms); values of one tree alone are counted only. Of factors L of a
+covariance L L' is compared, which the signs of singular vectors do not change. To record another
 commit: run this file with PYTHONPATH set to its work tree.
 """
 
@@ -30,10 +31,15 @@ from pathlib import Path
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_libraries, "1")
 
+import numpy as np  # noqa: E402  # once the number of threads is set
+
 ROOT = Path(__file__).resolve().parents[1]
 SENTENCES = {"sentence", "text", "reasons", "warnings", "advice", "created", "file", "version",
-             "message", "rejected_text", "sha256", "action"}
-"""Keys whose values are words for a reader, or differ from run to run."""
+             "message", "rejected_text", "sha256", "action", "digest"}
+"""Keys whose values are words for a reader, or differ from run to run or with the last bit."""
+
+FACTORS = "/covariance_terms/"
+"""Where the factors of a result are."""
 
 OPTIONS = ([], ["--model", "none"], ["--robust"], ["--validate"], ["--misalignment", "linear"],
            ["--theta-datum", "xy_axes"], ["--model", "drift"], ["--model", "plate_scale"],
@@ -157,6 +163,34 @@ def allowed_in(case: dict[str, object], part: float) -> float:
     return part * (sum(value**2 for value in u) / len(u)) ** 0.5 if u else 0.0
 
 
+def factors_of(case: dict[str, object]) -> list[np.ndarray]:
+    """Return the factors of a case as columns: over the map, and over each thing beside it."""
+    def rows(name: str) -> np.ndarray:
+        found = np.array(case.get(f"{FACTORS}{name}", []), dtype=float)
+        return found.reshape(len(found), found[:1].size)
+
+    of_map, shared = rows("factors"), int(str(case.get(f"{FACTORS}beside/with_map", 0)))
+    parts = [of_map]
+    for name in ("plate", "lines", "microscope"):
+        beside = rows(f"beside/{name}")
+        if len(beside):  # the first belong to factors of the map, the others leave it as it is
+            other = np.zeros((len(of_map) - shared, beside.shape[1]))
+            parts.append(np.concatenate([beside[:shared], other, beside[shared:]]))
+    most = max(map(len, parts))
+    return [np.pad(part, ((0, most - len(part)), (0, 0))) for part in parts]
+
+
+def same_covariance(old: dict[str, object], new: dict[str, object], part: float) -> bool:
+    """Return whether L L' agrees, to a part of the largest variance of map, plate and lines."""
+    before, after = factors_of(old), factors_of(new)
+    if [columns.shape[1] for columns in before] != [columns.shape[1] for columns in after]:
+        return False
+    size = np.concatenate([np.full(columns.shape[1], np.sqrt((columns**2).sum(axis=0)).max(
+        initial=0.0)) for columns in before])
+    one, other = (np.hstack(columns) for columns in (before, after))
+    return bool((abs(one.T @ one - other.T @ other) <= part * np.outer(size, size)).all())
+
+
 def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, object]],
             part: float = 0.0) -> int:
     """Print which values differ, and return how many cases have any."""
@@ -165,14 +199,17 @@ def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, obj
     for name in before.keys() & after.keys():
         old, new = before[name], after[name]
         allowed = allowed_in(old, part)
-        wrong = [path for path in old.keys() & new.keys()
-                 if differ(old[path], new[path], allowed, 0.0 if "_map/" in path else part)]
+        wrong = [path for path in old.keys() & new.keys() if not path.startswith(FACTORS)
+                 and differ(old[path], new[path], allowed, 0.0 if "_map/" in path else part)]
+        if not same_covariance(old, new, part):
+            wrong.append(FACTORS)
         for path in old.keys() ^ new.keys():
             alone["/".join(part for part in path.split("/") if not part.isdigit())] += 1
         if wrong:
             different += 1
-            print(f"{name}: {len(wrong)} values differ, first {sorted(wrong)[0]}: "
-                  f"{str(old[sorted(wrong)[0]])[:80]} -> {str(new[sorted(wrong)[0]])[:80]}")
+            first = sorted(wrong)[0]
+            print(f"{name}: {len(wrong)} values differ, first {first}: "
+                  f"{str(old.get(first))[:80]} -> {str(new.get(first))[:80]}")
     for path, count in sorted(alone.items()):
         print(f"in one tree alone: {path} ({count} times)")
     print(f"{len(before.keys() & after.keys())} cases, {different} differ")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The comparison of two trees: what counts as a difference, and what a session draws."""
 
+from copy import deepcopy
+
 import pytest
 
 from tools.same import compare, leaves, session
@@ -35,3 +37,27 @@ def test_a_map_may_differ_by_a_part_of_its_u_and_a_number_by_that_of_itself(g, p
                      for one, two in ((1e-7, 0.5), (g, p)))
     assert compare(before, after, 1e-3) == differing
     assert compare(before, after) == ((g, p) != (1e-7, 0.5))
+
+
+FACTORS = "/covariance_terms/factors"
+PLATE = "/covariance_terms/beside/plate"
+FACTORED = {FACTORS: [[[3.0, 1.0]], [[0.5, 2.0]], [[0.0, 0.1]]], PLATE: [[[7.0]], [[1.0]], [[4.0]]],
+            "/covariance_terms/beside/with_map": 2}
+"""Two factors of a term, one of an effect, and what a term makes of the plate alone."""
+
+
+def with_sign(row, *, of_plate):
+    case = deepcopy(FACTORED)
+    case[FACTORS][row] = [[-value for value in case[FACTORS][row][0]]]
+    if of_plate:
+        case[PLATE][row] = [[-value for value in case[PLATE][row][0]]]
+    return case
+
+
+@pytest.mark.parametrize(("after", "differing"), [
+    (with_sign(0, of_plate=True), 0), (with_sign(0, of_plate=False), 1),
+    (with_sign(2, of_plate=False), 0),
+    (FACTORED | {FACTORS: FACTORED[FACTORS][::-1], PLATE: FACTORED[PLATE][::-1]}, 1),
+    (FACTORED | {FACTORS: [[[3.0, 1.0]], [[0.5, 2.0]], [[0.0, 0.2]]]}, 1)])
+def test_factors_differ_where_their_covariance_does(after, differing):
+    assert compare({"case": FACTORED}, {"case": after}, 1e-3) == differing
