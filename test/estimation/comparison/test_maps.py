@@ -23,12 +23,12 @@ ARTIFACT = Artifact(7, 0.01, 12)
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 
 
-def calibrated(seed, truth=None, *, method="joint", sigma=SIGMA_M):
+def calibrated(seed, truth=None, *, sigma=SIGMA_M):
     rng = np.random.default_rng(seed)
     truth = truth or random_truth(ARTIFACT, 4, np.random.default_rng(99))
     readings = simulate_measurements(truth, hu_plan(truth.artifact), rng, sigma_m=sigma,
                                      sigma_theta_rad=SIGMA_RAD)
-    return calibrate(readings, bare(method=method, causes=False))
+    return calibrate(readings, bare(causes=False))
 
 
 A, B = calibrated(1), calibrated(2)

@@ -268,7 +268,7 @@ class TestHostile:
             calibrate(self.readings(k=k), BARE)
 
     def test_unknown_options(self):
-        with pytest.raises(InputError, match="method: 'magic' is unknown"):
-            bare(method="magic")
+        with pytest.raises(InputError, match="misalignment_model: 'magic' is unknown"):
+            bare(misalignment_model="magic")
         with pytest.raises(InputError, match="datum_theta: 'free' is unknown"):
             bare(datum_theta="free")
