@@ -242,8 +242,8 @@ def _stopped(e: Evidence) -> str | None:
 
 def _place(e: Evidence, stage_m: complex) -> str:
     """Return where the stage is indicated, from its place in the sense of the measurement."""
-    sign = -1 if e.sense is Sense.PLATE_MOVES else 1
-    return f"x = {sign * stage_m.real:.6g} m, y = {sign * stage_m.imag:.6g} m"
+    at = e.sense.sign * stage_m
+    return f"x = {at.real:.6g} m, y = {at.imag:.6g} m"
 
 
 def wrong_joints(e: Evidence) -> str | None:

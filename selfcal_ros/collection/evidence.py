@@ -207,10 +207,9 @@ class DetectionsSeen:
             x, y = self.artifact.places(table["m"][good], table["n"][good])
             offset = np.stack([table["ox"][good], table["oy"][good]])
             cells = places_of_cells(readings.view, offset)
-            sign = -1 if self.sense is Sense.PLATE_MOVES else 1
             found[index] = NamedMarks(
                 readings.view.name, readings.view.on_stage(self.artifact), x + 1j * y,
-                sign * where[good] / pitch, _complex(cells) / pitch,
+                self.sense.sign * where[good] / pitch, _complex(cells) / pitch,
                 _complex(offset - cells) / pitch, listed=self.artifact.marks is not None)
         return found
 

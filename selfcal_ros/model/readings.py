@@ -37,6 +37,11 @@ class Sense(StrEnum):
     MICROSCOPE_MOVES = "microscope_moves"
     PLATE_MOVES = "plate_moves"
 
+    @property
+    def sign(self) -> int:
+        """Sign of the stage's position over the place of the mark that it measures."""
+        return -1 if self is Sense.PLATE_MOVES else 1
+
 
 def turned_over(sense: str, field: np.ndarray, *, sign: int = -1,
                 axes: tuple[int, int] = (-2, -1)) -> np.ndarray:

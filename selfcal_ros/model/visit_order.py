@@ -102,7 +102,7 @@ def stage_targets(artifact: Artifact, view: View, visits: VisitSequence,
         return np.zeros((2, 0))
     places = artifact.places(visits.m, visits.n)
     site = np.stack(view.on_stage(artifact).site_of(*places)) * artifact.grid_pitch_m
-    return -site if sense is Sense.PLATE_MOVES else site
+    return sense.sign * site
 
 
 def line_targets(artifact: Artifact, view: View, sense: Sense, *,
@@ -129,7 +129,7 @@ def line_targets(artifact: Artifact, view: View, sense: Sense, *,
     line = np.arange(count)
     turn = (line + view.on_stage(artifact).s) % count if count else np.zeros(0)
     nominal = turn * (2 * np.pi / count) if count else turn
-    centre = -nominal if sense is Sense.PLATE_MOVES else nominal
+    centre = sense.sign * nominal
     k = np.repeat(line, view.repeats) if consecutive else np.tile(line, view.repeats)
     return k, centre[k]
 

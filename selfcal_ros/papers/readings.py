@@ -24,7 +24,7 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     """
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
-    pose, sign = view.on_stage(artifact), -1 if sense is Sense.PLATE_MOVES else 1
+    pose, sign = view.on_stage(artifact), sense.sign
     sites = np.stack(pose.site_of(*artifact.places(*physics.all_marks(artifact))))
     inside = ~pose.beyond_field(sites, artifact)
     out, stop = np.full_like(site, np.nan), sign * site[:, inside]
@@ -41,7 +41,7 @@ def angular_deviation(truth: Truth, index: int, view: View, *,
                       sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
     """Return the noise-free deviation of every angular line in a view, (K,), rad."""
     direction, nominal, _ = physics.line_directions(truth, index, view)
-    sign = -1 if sense is Sense.PLATE_MOVES else 1
+    sign = sense.sign
     return direction - nominal + sign * physics.encoder_error(truth, sign * nominal)
 
 

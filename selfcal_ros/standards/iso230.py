@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import covariance_of
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, ViewReadings
 
 DRAWS = 2000
 """Draws behind the uncertainties: 1.6 % standard error."""
@@ -121,7 +121,7 @@ def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Sca
     if measurements.artifact.map_grid is not None:
         raise InputError("iso230", "the map has nodes of its own, off the marks",
                          "give its RESULT.json: figures without repeats")
-    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+    sign = measurements.sense.sign
     groups: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
     for view in measurements.views:
         for site, group in _groups(view, measurements, axis, sign):

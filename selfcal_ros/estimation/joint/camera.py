@@ -373,7 +373,6 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     covariance *= noise.sigma**2
     yaw, n = centred @ values[rows], len(centred) - 1
     statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw
-    sign = -1 if sense is Sense.PLATE_MOVES else 1  # (1.6) and its rotations
-    place = sign * nodes.nodes[seen]
-    return StageYawMap(place.real, place.imag, sign * yaw, np.sqrt(np.diag(covariance)),
+    place = sense.sign * nodes.nodes[seen]  # (1.6) and its rotations
+    return StageYawMap(place.real, place.imag, sense.sign * yaw, np.sqrt(np.diag(covariance)),
                        float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))

@@ -62,7 +62,13 @@ from selfcal_ros.estimation.terms.equations import (
 )
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
-from selfcal_ros.model.readings import GridVisits, Measurements, Sense
+from selfcal_ros.model.readings import (
+    GridVisits,
+    Measurements,
+    Sense,
+    lines_turned_over,
+    turned_over,
+)
 from selfcal_ros.model.result import (
     ArtifactMap,
     CalibrationResult,
@@ -241,10 +247,7 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
     if cover.system.grid.n_sites > MAX_FULL:
         return {}
     maps = cover.maps_of_terms()[0]
-    maps = maps.reshape(*shape, maps.shape[1])
-    sign = 1
-    if sense is Sense.PLATE_MOVES:  # G(X) = -H(-X), and L L' is the same for -L
-        maps, sign = maps[::-1, ::-1], -1
+    maps = turned_over(sense, maps.reshape(*shape, maps.shape[1]), axes=(0, 1))
     both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
                            maps.imag.reshape(-1, maps.shape[2])])
     others = np.concatenate([np.zeros((0, maps.shape[2])), *(
@@ -261,7 +264,7 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         alone += list((left * size).T[size > NEGLIGIBLE])
     found = {"terms": names, "factors": rounded(np.array(factors)).tolist()}
     if beside:
-        all_of = sign * np.array([*moved, *alone]).reshape(-1, len(others))
+        all_of = np.array([*moved, *alone]).reshape(-1, len(others))
         ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
         found[BESIDE] = {"with_map": len(names)} | {
             name: rounded(part.reshape(len(part), *values.shape[1:])).tolist()
@@ -523,14 +526,11 @@ def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
     """Return the sites and lines of the map, stage frame, that only single readings determine."""
-    flipped = sense is Sense.PLATE_MOVES  # as the map itself: G(X) = -H(-X)
-    unchecked = system.unchecked_sites[::-1, ::-1] if flipped else system.unchecked_sites
+    unchecked = turned_over(sense, system.unchecked_sites, sign=1)
     sites = np.argwhere(unchecked) - np.array(unchecked.shape) // 2
-    lines = np.argwhere(system.unchecked_lines)
+    lines = np.argwhere(lines_turned_over(sense, system.unchecked_lines, sign=1))
     if not len(sites) and not len(lines):
         return ()
-    if flipped:
-        lines = np.sort(-lines % max(system.angular.n_lines, 1), axis=0)
     return (Finding("unchecked", details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()}),)
 
 
@@ -617,10 +617,10 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
     field = np.where(known, found.field, complex(np.nan, np.nan))
     g_theta = np.where(system.known_lines, found.g_theta, np.nan)
     o, r = system.gauge.first_order(found.field)
-    if measurements.sense is Sense.PLATE_MOVES:
-        field, u_x, u_y = -field[::-1, ::-1], u_x[::-1, ::-1], u_y[::-1, ::-1]
-        back = -np.arange(len(g_theta)) % max(len(g_theta), 1)
-        g_theta, u_theta = -g_theta[back], u_theta[back]
+    sense = measurements.sense
+    field = turned_over(sense, field)
+    u_x, u_y = (turned_over(sense, u, sign=1) for u in (u_x, u_y))
+    g_theta, u_theta = lines_turned_over(sense, g_theta), lines_turned_over(sense, u_theta, sign=1)
     return ErrorMap(measurements.artifact.field, field.real.copy(), field.imag.copy(), u_x, u_y,
                     g_theta, u_theta, o / length, r / length,
                     problem.conditions.datum), closure, kept
@@ -637,9 +637,8 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
     if system.angular.n_views:
         stage, of_plate = cover.terms
         of_plate = of_plate + stage[system.known_lines].mean(axis=0)
+        stage = lines_turned_over(sense, stage)
         lines = np.stack([stage, of_plate]).transpose(2, 0, 1) * length
-        if sense is Sense.PLATE_MOVES:
-            lines[:, 0] = -lines[:, 0, -np.arange(lines.shape[2]) % lines.shape[2]]
     of_offsets = -length * np.array([[
         block_of(column.term).of_offsets and column.component == part
         for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)

@@ -33,7 +33,7 @@ from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.pose import EDGE
-from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.units import MM_PER_M
@@ -340,7 +340,7 @@ def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
     if not len(view.m):
         return None
     at, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
-    sign = -1 if measurements.sense is Sense.PLATE_MOVES else 1
+    sign = measurements.sense.sign
     rows, there = rows_at(sign * at, plate)
     stage = sign * (rows @ (old.gx + 1j * old.gy)[plate.together.sites])
     marks = plate.result.artifact_map

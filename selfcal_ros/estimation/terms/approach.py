@@ -17,7 +17,7 @@ from selfcal_ros.model.terms import ModelTerm
 def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     """Yield the signs along x and along y."""
     # in the nominal frame, as the map: an approach that every visit has is the map's
-    found = inputs.at_visits(lambda visits: inputs.indicated * np.stack(
+    found = inputs.at_visits(lambda visits: inputs.sense.sign * np.stack(
         [visits.approach_x, visits.approach_y]).astype(complex), nominal=True)
     for coefficient, (marks, visits) in zip(AXES, found, strict=False):
         yield Pattern((coefficient,), marks, visits)

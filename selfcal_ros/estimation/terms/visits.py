@@ -290,8 +290,8 @@ class TermInputs:
         Visits of each view.
     names : tuple of str
         Names of the views.
-    indicated : int
-        Sign of the indicated position in a reading.
+    sense : Sense
+        What moves.
     line_names : tuple of str
         Names of the views in which lines were read.
     n_lines : int
@@ -318,7 +318,7 @@ class TermInputs:
     weight: np.ndarray
     visits: tuple[ViewVisits | None, ...]
     names: tuple[str, ...]
-    indicated: int = 1
+    sense: Sense = Sense.MICROSCOPE_MOVES
     line_names: tuple[str, ...] = ()
     n_lines: int = 0
     with_lines: tuple[int, ...] = ()
@@ -403,7 +403,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
                               measurements.artifact.flat(view.m, view.n))
                    for row, view in enumerate(readings))
     return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
-                      -1 if measurements.sense is Sense.PLATE_MOVES else 1,
+                      measurements.sense,
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),

@@ -40,7 +40,7 @@ from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, Score, TermEquat
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Cause
@@ -268,7 +268,7 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
     if not np.isfinite(u).any():
         return np.full_like(u, model.found.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
     u = np.nan_to_num(u, nan=rms(u))
-    return u if model.problem.ground.indicated > 0 else u[:, ::-1, ::-1]  # method eq. 1.6
+    return turned_over(model.problem.ground.sense, u, sign=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_r
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.plate_form import with_nodes
-from selfcal_ros.model.readings import Measurements, Sense
+from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Cause
 
@@ -80,7 +80,7 @@ class Adequacy:
             return Effect(NAME, np.zeros((2, *emap.gx.shape)), np.where(
                 np.isfinite(emap.g_theta), self.lack, 0.0))
         sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
-        local = self.local if result.sense == Sense.MICROSCOPE_MOVES else self.local[:, ::-1, ::-1]
+        local = turned_over(result.sense, self.local, sign=1)
         each = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
         return Effect(NAME, each, np.zeros(len(emap.g_theta)))
 

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.joint.solve import (
     variance_of_terms,
 )
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
 
@@ -70,9 +70,8 @@ def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray)
     sense : str
         Sense of the measurement.
     """
-    if sense == Sense.PLATE_MOVES:
-        field, theta = -field[::-1, ::-1], -np.roll(theta[::-1], 1)
-    return Effect(name, np.stack([field.real, field.imag]), theta)
+    field = turned_over(sense, field)
+    return Effect(name, np.stack([field.real, field.imag]), lines_turned_over(sense, theta))
 
 
 def difference(name: str, one: CalibrationResult, other: CalibrationResult) -> Effect:
