@@ -264,7 +264,7 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
         error_map, filled = fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)
         if filled:
-            print(f"selfcal {args.verb}: {filled} unknown sites filled from their neighbours",
+            print(f"{args.leaf.prog}: {filled} unknown sites filled from their neighbours",
                   file=sys.stderr)
     return result, filled
 
@@ -272,7 +272,7 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
 def say_bent(args: argparse.Namespace, bent_m: float) -> None:
     """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
     if bent_m >= LEAST_BEND_M:
-        print(f"selfcal {args.verb}: --onto: the active table is curved between the nodes of the "
+        print(f"{args.leaf.prog}: --onto: the active table is curved between the nodes of the "
               f"map by up to {bent_m / M_PER_UM:.3g} um, which the new table does not reproduce; "
               "calibrate with the nodes of that table, or without it", file=sys.stderr)
 

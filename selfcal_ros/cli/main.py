@@ -122,7 +122,7 @@ def _run(words: list[str]) -> int:
             return int(ExitCode.DONE)
         args = parser.parse_args(words)
         args.words = words
-        prefix = f"selfcal {args.verb}"
+        prefix = args.leaf.prog
         check_existing(args)
         return int(args.run(args))
     except SelfcalError as error:

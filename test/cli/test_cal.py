@@ -43,7 +43,7 @@ def run(tmp_path, capsys, monkeypatch):
 
 
 def one_line(err, *parts):
-    assert err.startswith("selfcal cal: ") and err.count("\n") == 1
+    assert err.startswith("selfcal cal") and err.count("\n") == 1
     assert all(part in err for part in parts)
 
 

@@ -168,6 +168,7 @@ def test_a_table_that_does_not_fit_is_refused_as_such(tmp_path, monkeypatch, cap
     mend = ("name the table of this stage, in this unit (--unit)" if "kmotion" in verb
             else "is it that of this stage, in this unit?")
     assert re.fullmatch(
-        rf"selfcal (cal|export): --onto: {re.escape(where)}changes by up to [\d.e+]+ mm between "
+        rf"selfcal (cal export|export): --onto: {re.escape(where)}changes by up to "
+        rf"[\d.e+]+ mm between "
         rf"neighbouring sites 10 mm apart; {re.escape(mend)}\n", capsys.readouterr().err)
     assert not Path("new").exists()
