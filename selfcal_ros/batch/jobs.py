@@ -22,6 +22,7 @@ from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
@@ -79,7 +80,7 @@ def solved(job: folder.Job, source: dict[str, str],
         if not isinstance(error.observability, results.Observability):
             raise
         result = worded(results.unidentified_result(session.measurements, error.observability))
-        problem = error
+        problem = told(error)
     return results.with_input(result, source, session.lost), problem
 
 

@@ -29,7 +29,14 @@ from selfcal_ros.cli.verbs import (
     summary_of,
     verbs_of_others,
 )
-from selfcal_ros.errors import ExitCode, InputError, SelfcalError, did_you_mean, printable
+from selfcal_ros.errors import (
+    ExitCode,
+    InputError,
+    NotIdentifiableError,
+    SelfcalError,
+    did_you_mean,
+    printable,
+)
 from selfcal_ros.portable import hold_interrupts
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
@@ -127,6 +134,9 @@ def _run(words: list[str]) -> int:
         return int(args.run(args))
     except SelfcalError as error:
         fault = (misplaced(args) if args is not None else None) or error
+        if isinstance(fault, NotIdentifiableError):
+            from selfcal_ros.reporting.words.observability import told  # numpy: half a second
+            fault = told(fault)
         return _refused(f"{prefix}: {fault}", fault.exit_code)
     except KeyboardInterrupt:
         return _refused(f"{prefix}: interrupted", 128 + signal.SIGINT)

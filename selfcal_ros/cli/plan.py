@@ -41,6 +41,7 @@ from selfcal_ros.model.terms import ModelTerm, in_order, parse_terms
 from selfcal_ros.model.view import Plan, parse_order
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.summary.numbers import counted
+from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.tables import plan_budget_text, search_text, step_text
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
@@ -115,6 +116,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
             budget = plan_budget(plan, terms, assumed, alone,
                                  asked=[term.name for term in declared])
+    seen = worded_observability(seen)
     if args.json:
         found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
@@ -172,7 +174,8 @@ def _check_json(plan: Plan, found: tuple[Observability, int], predicted: Predict
     seen, unknown = found
     out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
            "deficiency": seen.deficiency, "identifiable": seen.identifiable,
-           "modes": list(seen.modes), "advice": list(seen.advice), "predicted": None,
+           "modes": [mode.text for mode in seen.modes],
+           "advice": [advice.text for advice in seen.advice], "predicted": None,
            "unknown_sites": unknown if seen.identifiable else None,
            "unchecked_sites": seen.unchecked_sites, "unchecked_lines": seen.unchecked_lines}
     if predicted is not None:
@@ -196,8 +199,9 @@ def _check_text(plan: Plan, found: tuple[Observability, int],
              _rank_text(seen)]
     if predicted is None or not seen.identifiable:
         lines += ["the plan does not identify the stage: it cannot determine"]
-        lines += [f"  - {text}" for text in seen.modes]
-        return lines + ["to determine all of it,"] + [f"  - {text}" for text in seen.advice]
+        lines += [f"  - {mode.text}" for mode in seen.modes]
+        return [*lines, "to determine all of it,",
+                *(f"  - {advice.text}" for advice in seen.advice)]
     lines += [_known_text(plan, unknown), *_unchecked_text(seen),
               "predicted standard uncertainty, in units of the noise of one averaged reading:",
               f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]

@@ -20,7 +20,6 @@ from selfcal_ros.estimation.observability.plan_check import (
     CHECK_OFFSET_M,
     candidate_views,
     check_plan,
-    describe_view,
     measured_like,
     predict_plan,
 )
@@ -43,6 +42,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
 from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.reporting.words.observability import describe_view, worded_observability
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 REPEATS = {1: "", 2: "there_and_back@plate", 4: "x_back_y_back@plate"}
@@ -344,7 +344,7 @@ def _budget(plan: Plan) -> PlanBudget:
     seen = check_plan(plan).observability
     if not seen.identifiable:  # only a search that misses its aim
         raise InputError("--marks", "no plan of these marks identifies the stage",
-                         "; ".join(seen.advice))
+                         "; ".join(each.text for each in worded_observability(seen).advice))
     return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
 
 

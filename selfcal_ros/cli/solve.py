@@ -47,6 +47,7 @@ from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.reporting.words.phrases import recheck_lines
 from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
 
@@ -191,17 +192,18 @@ def run(args: argparse.Namespace) -> int:
     try:
         with busy("solving"):
             result = _calibrated(args, measurements, options, method=solver.method)
-    except NotIdentifiableError as error:
+    except NotIdentifiableError as refused:
+        error = told(refused)
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
             result = worded(with_places(result, measurements.views))
             _write(args, result_to_dict(created_now(
                 with_input(result, bag_input(args.bag), lost))))
         if set(findings) - set(lost):  # a fault of the cell: a plate placed otherwise, a wrong sign
-            raise InputError(args.bag, "correct this first", f"as it is, {error}") from error
+            raise InputError(args.bag, "correct this first", f"as it is, {error}") from refused
         if findings:  # missing readings look like a deficient plan
             raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
-                                       error.observability) from error
+                                       error.observability) from refused
         raise
     if options.plate is not None and options.plate.input.get("sha256") == bag_input(
             args.bag)["sha256"]:

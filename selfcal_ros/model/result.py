@@ -117,9 +117,9 @@ class Observability:
         Unseen modes in XY and theta together; 0 means identifiable.
     identifiable : bool
         Whether the stage error is determined.
-    modes : tuple of str
-        The unseen modes in words.
-    advice : tuple of str
+    modes : tuple of Finding
+        The unseen modes.
+    advice : tuple of Finding
         Views or marks that would cure a deficiency.
     unchecked_sites, unchecked_lines : int, optional
         Number of sites and lines of the map that depend on single readings, which no other reading
@@ -130,8 +130,8 @@ class Observability:
     unknowns: int
     deficiency: int
     identifiable: bool
-    modes: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
+    modes: tuple[Finding, ...] = ()
+    advice: tuple[Finding, ...] = ()
     unchecked_sites: int | None = None
     unchecked_lines: int | None = None
 
@@ -315,7 +315,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                       "scale_difference": plain(emap.scale_difference),
                       "datum_theta": str(emap.datum_theta)},
         "artifact_map": {key: plain(getattr(amap, key)) for key in _PLATE_ARRAYS},
-        "observability": plain(result.observability),
+        "observability": _seen_to_dict(result.observability),
         "noise": plain(result.noise),
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
@@ -419,7 +419,7 @@ def _parse(data: dict) -> CalibrationResult:
         nonorthogonality=read(float, emap["nonorthogonality"]),
         scale_difference=read(float, emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]))
-    seen = read(Observability, data["observability"])
+    seen = _seen_from_dict(read(dict, data["observability"]))
     return CalibrationResult(
         read(str, data["plan_id"]), error_map,
         _plate(amap, artifact, raw),
@@ -459,6 +459,20 @@ def _view(v: dict) -> ViewResult:
                       rejected=read(int, v["rejected"]),
                       read_grid=v.get("read", {}).get("grid"),
                       read_angular=v.get("read", {}).get("angular"))
+
+
+def _seen_to_dict(seen: Observability) -> dict[str, Any]:
+    """Return the JSON form of an observability: modes and advice in words."""
+    words = {"modes": [found.text for found in seen.modes],
+             "advice": [found.text for found in seen.advice]}
+    return plain(replace(seen, modes=(), advice=())) | words
+
+
+def _seen_from_dict(data: dict[str, Any]) -> Observability:
+    words = {name: tuple(Finding("in_words", text=text)
+                         for text in read(tuple[str, ...], data.get(name, [])))
+             for name in ("modes", "advice")}
+    return replace(read(Observability, data | {"modes": [], "advice": []}), **words)
 
 
 def _array(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -24,6 +24,7 @@ from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.reporting.words.verification import with_verification
 from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
@@ -66,7 +67,7 @@ def solve(job: Job) -> Outcome:
         return Outcome(job, _finished(job, found), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
-        return Outcome(job, _finished(job, result), error)
+        return Outcome(job, _finished(job, result), told(error))
     except Exception as error:  # reported by `take`, in the thread of the session
         return Outcome(job, None, error)
 
@@ -349,7 +350,8 @@ class SolvingSession:
         planned = self._planned_views(shown.run)
         advice = [f"{counted(planned - shown.views_done, 'view')} to come"]
         if not self._unfinished():
-            advice = [str(shown.problem)] if result is None else list(result.observability.advice)
+            advice = [str(shown.problem)] if result is None else [
+                found.text for found in result.observability.advice]
         self._ports.publish("summary", {
             "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
             "state": self._state(), "views_done": shown.views_done,

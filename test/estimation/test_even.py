@@ -16,6 +16,7 @@ from selfcal_ros.papers.methods import calibrate_by, calibrate_by_law
 from test.support.collecting import collect, scene
 from test.support.dense_lattice import solve
 from test.support.plans import image_plan, plan_of
+from test.support.refusals import in_words
 from test.support.truth import random_truth, simulate_measurements
 
 PLANS = ("0, 90, tx", "0, 90, 180, 270, tx, ty", "0, 90, -tx")
@@ -140,6 +141,6 @@ def test_a_quarter_turn_of_mixed_sides_is_half_a_pitch_beside():
                                          r"pitch; shift it by \[0.5, 0.5\] pitch"):
         plan.views[1].on_stage(plan.artifact)
     seen = check_plan(replace(plan, views=(plan.views[0], plan.views[2]))).observability
-    assert seen.advice[0] == ("add a view turned by 90 deg and shifted by +0.5 pitch along X and "
-                              "+0.5 pitch along Y")
+    assert in_words(seen.advice)[0] == ("add a view turned by 90 deg and shifted by +0.5 pitch "
+                                        "along X and +0.5 pitch along Y")
     assert check_plan(mixed_plan("0, 90, tx", 8, 5)).observability.identifiable

@@ -14,6 +14,7 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from test.support.collecting import collect, scene
 from test.support.plans import image_plan
+from test.support.refusals import in_words
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -39,7 +40,7 @@ def test_one_turn_is_not_and_the_other_is_suggested():
     plan = image_plan(7, turns=(0,))
     seen = check_plan(plan).observability
     assert seen.deficiency == 2
-    assert "90 deg" in seen.advice[0]
+    assert "90 deg" in in_words(seen.advice)[0]
     _, ranked = rank_next(plan, criterion="rms", datum=ThetaDatum.ZERO_MEAN)
     assert ranked[0].view.image == plan.views[0].image
     assert ranked[0].score.deficiency == 0

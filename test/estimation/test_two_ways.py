@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import ReferenceLength
@@ -18,6 +17,7 @@ from selfcal_ros.model.readings import Sense, ViewReadings, subset
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values
+from test.support.refusals import refused
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 from test.support.two_ways import (
     maps_of,
@@ -153,7 +153,7 @@ def test_a_view_that_was_never_read_is_missed_by_name():
     gone = {1, 4}  # both views turned by a quarter
     views = tuple(ViewReadings(view.view) if i in gone else view
                   for i, view in enumerate(readings.views))
-    with pytest.raises(NotIdentifiableError, match="add a view turned by 90 deg"):
+    with refused("add a view turned by 90 deg"):
         calibrate(replace(readings, views=views), BARE)
 
 

@@ -90,7 +90,8 @@ def test_an_unidentified_plan_has_maps_of_nulls():
     measured = Measurements("p", Artifact(3, 0.01, 4), (
         ViewReadings(view, used=9, rejected={"duplicate": 2}),), rejected={"outside_every_view": 1})
     result = worded(unidentified_result(
-        measured, Observability(25, 39, 14, False, ("m",), ("add tx",))))
+        measured, Observability(25, 39, 14, False, (Finding("in_words", text="m"),),
+                                (Finding("in_words", text="add tx"),))))
     again = through_json(result)
     assert_same(again, result)
     assert np.isnan(again.error_map.gx).all()

@@ -15,7 +15,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, Grade, Provenance, Remedy, Verdict
+from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Remedy, Verdict
 from selfcal_ros.reporting.chapters import MAX_ROWS, convention_section, extra_sections, heading
 from selfcal_ros.reporting.report import report_html, write_report
 from selfcal_ros.reporting.turning import script
@@ -248,7 +248,8 @@ def test_text_from_files_is_escaped():
         input={"file": evil, evil: evil}, method=evil, sense=evil,
         extra={evil: evil, "outliers": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
-        observability=Observability(1, 2, 1, False, (evil,), (evil,)))
+        observability=Observability(1, 2, 1, False, (Finding("", text=evil),),
+                                    (Finding("", text=evil),)))
     page = parsed(html_of(hostile))
     assert page.tags.count("script") == 1  # that of the page
     assert evil in "".join(page.text)
@@ -256,7 +257,8 @@ def test_text_from_files_is_escaped():
 
 def test_a_deficient_plan_is_marked_and_comes_first():
     result, _ = known_result(3, 0)
-    seen = Observability(1, 3, 2, False, ("scale difference",), ("add a view turned by 90 deg",))
+    seen = Observability(1, 3, 2, False, (Finding("", text="scale difference"),),
+                         (Finding("", text="add a view turned by 90 deg"),))
     html = html_of(replace(result, observability=seen))
     assert '<p class="verdict not_qualified">Not a calibration: 2 modes' in html
     assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Map</h2>")

@@ -270,7 +270,8 @@ def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
     last = desk.hands.of("summary")[-1]
     assert (last["views_done"], last["views_planned"]) == (1, 4)
     assert "do not identify the stage" in last["state"]
-    assert last["advice"] == list(desk.session.result.observability.advice) != []
+    assert last["advice"] == [
+        advice.text for advice in desk.session.result.observability.advice] != []
     assert desk.session.diagnosis().level == Level.WARN
 
 

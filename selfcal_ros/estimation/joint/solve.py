@@ -50,7 +50,7 @@ from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations, PlacedEquations, system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
-from selfcal_ros.estimation.observability.rank import identifies, measured_observability, refusal
+from selfcal_ros.estimation.observability.rank import identifies, measured_observability
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
@@ -446,7 +446,9 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
                     tuple(v.view for v in measurements.views))
         if not identifies(plan.artifact, plan.views):
             seen = with_unseen_modes(seen, system, plan).observability
-        raise NotIdentifiableError(refusal(seen), seen)
+        raise NotIdentifiableError("the marks that were read do not identify the stage "
+                                   f"({seen.deficiency} mode{'s' * (seen.deficiency != 1)} "
+                                   "undetermined)", seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
     ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)

@@ -15,7 +15,7 @@ from selfcal_ros.estimation.datum.covariance import MapsCovariance, conditions_f
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import NormalEquations, planned_system
 from selfcal_ros.estimation.observability.rank import (
-    UnseenMode,
+    add_views,
     full_observability,
     identifies,
     unseen_modes,
@@ -26,7 +26,6 @@ from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import ORDERS, Plan, View, parse_order, with_sub_views
-from selfcal_ros.units import MM_PER_M
 
 MAX_SITES = 151 * 151
 """Largest field whose uncertainty map is predicted in full."""
@@ -126,9 +125,7 @@ class PlanCheck:
     Attributes
     ----------
     observability : Observability
-        Rank, deficiency, unseen modes in words, advice.
-    modes : tuple of UnseenMode
-        The unseen modes with an example map each.
+        Rank, deficiency, unseen modes, advice.
     cures : tuple of tuple of View
         The smallest sets of views that would make the plan identify the stage.
     unknown_sites : int
@@ -136,7 +133,6 @@ class PlanCheck:
     """
 
     observability: Observability
-    modes: tuple[UnseenMode, ...]
     cures: tuple[tuple[View, ...], ...] = ()
     unknown_sites: int = 0
 
@@ -148,12 +144,12 @@ def check_plan(plan: Plan) -> PlanCheck:
     seen = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
     if not seen.identifiable:
         return with_unseen_modes(seen, system, plan)
-    return PlanCheck(seen, (), unknown_sites=0 if plan.artifact.map_grid is None else int(
+    return PlanCheck(seen, unknown_sites=0 if plan.artifact.map_grid is None else int(
         (~system.known_sites).sum()))
 
 
 def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:
-    """Return the check of a deficient set of readings: unseen modes in words, and cures.
+    """Return the check of a deficient set of readings: unseen modes, and cures.
 
     Parameters
     ----------
@@ -166,11 +162,9 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
     """
     modes = tuple(unseen_modes(system))
     cures = tuple(find_cures(plan))
-    advice = tuple(("or add " if number else "add ")
-                   + " and ".join(describe_view(view, plan.artifact) for view in cure)
+    advice = tuple(add_views(plan.artifact, *cure, name="or_add_views" if number else "add_views")
                    for number, cure in enumerate(cures[:3]))
-    seen = replace(seen, modes=tuple(mode.text for mode in modes), advice=advice or seen.advice)
-    return PlanCheck(seen, modes, cures)
+    return PlanCheck(replace(seen, modes=modes, advice=advice or seen.advice), cures)
 
 
 @one_thread()
@@ -274,26 +268,6 @@ def smaller(plan: Plan, size: int) -> Plan:
     grid = plan.artifact.map_grid
     return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
         default_map_grid(plate), interpolation=grid.interpolation)))
-
-
-def describe_view(view: View, artifact: Artifact) -> str:
-    """Return a view in words: turn, shift in pitches (mm), kind of marks, repeats."""
-    turn = math.degrees(view.rotation_rad) % 360
-    if not view.grid:
-        lines = view.on_stage(artifact).turn_lines or 0
-        of_lines = "" if artifact.harmonics else f"{lines} line{'s' * (lines != 1)} ("
-        what = (f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
-                + ")" * bool(of_lines))
-    elif 1e-6 < turn < 360 - 1e-6:
-        what = f"a view turned by {turn:.6g} deg"
-    else:
-        what = "an unturned view"
-    unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
-    steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
-    shifted = [f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True)
-               if step]
-    also = " shifted by " if what.startswith("an unturned") else " and shifted by "
-    return what + (also + " and ".join(shifted) if shifted else "")
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ move whole fields.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from selfcal_ros.estimation.lattice.connectivity import Components
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import (
@@ -30,8 +29,8 @@ from selfcal_ros.estimation.normal.equations import (
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability
+from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.units import MM_PER_M
 
 DATUM_ROWS = 7
 """Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
@@ -146,9 +145,10 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
         return full
     sites, lines = system.known_sites, system.known_lines
     if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
-        text = (f"read the missing marks: only {int(sites.sum())} of {sites.size} sites and "
-                f"{int(lines.sum())} of {len(lines)} lines are determined")
-        return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(text,))
+        missing = Finding("marks_missing", details={
+            "sites": int(sites.sum()), "of_sites": sites.size, "lines": int(lines.sum()),
+            "of_lines": len(lines)})
+        return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(missing,))
     kept = 2 * int(sites.sum() + system.known_marks.sum())
     kept += int(system.known_views[:3 * system.grid.n_views].sum())
     kept -= system.grid.differences.shape[1]
@@ -186,60 +186,58 @@ def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ..
                  if i in system.grid_index or i in system.angular_index)
 
 
-def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[str, ...]:
-    """Return advice on the missing views of a deficient plan: a quarter turn, a shift, a line."""
+def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]:
+    """Return the views that a deficient plan lacks: a quarter turn, a shift, a line."""
     views = tuple(views)
     poses = [view.pose for view in views if view.grid]
-    advice, step = [], one_pitch(artifact)
+    turned, shifted, _ = _usual_views(artifact)
+    missing = []
     if len({round((pose.turn_rad / math.pi) % 1, 6) % 1 for pose in poses}) < 2:
-        advice.append(f"add a view {quarter_turn(artifact)}")
+        missing.append(turned)
     if len({(round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
             for x, y in (pose.shift_m for pose in poses)}) < 2:
-        advice.append(f"add a view shifted by {step} along X")
+        missing.append(shifted)
     if any(view.angular for view in views) and artifact.angular_count:
-        advice += _lines_advice(artifact, [v.on_stage(artifact).turn_lines or 0
-                                           for v in views if v.angular])
-    return tuple(advice) or _tried(artifact, views)
+        missing += _missing_lines(artifact, [v.on_stage(artifact).turn_lines or 0
+                                             for v in views if v.angular])
+    return tuple(add_views(artifact, view) for view in missing) or (_tried(artifact, views),)
 
 
-def one_pitch(artifact: Artifact) -> str:
-    """Return a shift by one pitch in words; of a list of marks, by their distance."""
-    return f"{artifact.grid_pitch_m * MM_PER_M:.2g} mm" if artifact.marks else "one pitch"
+def add_views(artifact: Artifact, *views: View, name: str = "add_views") -> Finding:
+    """Return the advice to add views."""
+    return Finding(name, details={"views": views, "plate": artifact})
 
 
-def quarter_turn(artifact: Artifact) -> str:
-    """Return a quarter turn in words, with the shift that it needs to lie on the lattice."""
-    beside = " and shifted by half a pitch along X and Y" if artifact.quarter_shift else ""
-    return f"turned by 90 deg{beside}"
-
-
-def _tried(artifact: Artifact, views: tuple[View, ...]) -> tuple[str, ...]:
-    """Return the first single view, by trial, that cures the plan."""
+def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
+    """Return a quarter turn, on the lattice, and a shift by one pitch along X and along Y."""
     pitch, beside = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
+    lines = artifact.angular_count > 0
+    turned = lines and artifact.angular_count % 4 == 0
+    return (View("", math.pi / 2, (beside, beside), True, turned),
+            View("", 0.0, (pitch, 0.0), True, lines), View("", 0.0, (0.0, pitch), True, lines))
+
+
+def _tried(artifact: Artifact, views: tuple[View, ...]) -> Finding:
+    """Return the first single view, by trial, that cures the plan."""
+    turned, along_x, along_y = usual = _usual_views(artifact)
     if artifact.map_grid is not None:
-        return (f"add views turned by 90 deg and shifted by about {one_pitch(artifact)}, or give "
-                "the map fewer nodes",)
-    for name, turn, shift in (("shifted by one pitch along Y", 0.0, (0.0, pitch)),
-                              ("shifted by one pitch along X", 0.0, (pitch, 0.0)),
-                              (quarter_turn(artifact), math.pi / 2, (beside, beside)),
-                              ("that is neither turned nor shifted", 0.0, (0.0, 0.0))):
-        more = View("", turn, shift, True, artifact.angular_count > 0 and (
-            not turn or artifact.angular_count % 4 == 0))
+        return add_views(artifact, *usual, name="add_views_or_fewer_nodes")
+    again = View("", 0.0, (0.0, 0.0), True, artifact.angular_count > 0)
+    for more in (along_y, along_x, turned, again):
         if identifies(artifact, (*views, more)):
-            return (f"add a view {name}",)
-    return ("add views turned by 90 deg and shifted by one pitch along X and along Y",)
+            return add_views(artifact, more)
+    return add_views(artifact, *usual)
 
 
-def _lines_advice(artifact: Artifact, turns: list[float]) -> list[str]:
-    """Return advice on the view of lines that is missing, if one is; turns in lines."""
+def _missing_lines(artifact: Artifact, turns: list[float]) -> list[View]:
+    """Return the view of lines that is missing, if one is; turns in lines."""
     count = artifact.angular_count
     if artifact.harmonics:
         lacks = HarmonicSystem(tuple(turns), np.ones((len(turns), count)), artifact.harmonics)
         best = best_turn_deg(np.array(turns) * (2 * np.pi / count), artifact.harmonics)
-        return [f"add an angular view turned by {best} deg"] if lacks.missed else []
+        return [View("", math.radians(best), grid=False)] if lacks.missed else []
     apart = [round(turn - turns[0]) for turn in turns]
-    return [f"add an angular view turned by one line ({360 / count:g} deg)"] if math.gcd(
-        count, *apart) > 1 else []
+    return [View("", 2 * math.pi / count, grid=False)] if math.gcd(count, *apart) > 1 else []
 
 
 def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
@@ -252,34 +250,8 @@ def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
     return int(turns_deg[(1 / np.maximum(information, 1e-12)).sum(axis=1).argmin()])
 
 
-def refusal(observability: Observability) -> str:
-    """Return the line that refuses a deficient measurement and names the cure."""
-    modes = f"{observability.deficiency} mode" + "s" * (observability.deficiency != 1)
-    return (f"the marks that were read do not identify the stage ({modes} undetermined): "
-            + "; ".join(observability.advice))
-
-
 MATCH = 1e-9
 """Largest relative residual sum of squares of an unseen field."""
-
-
-@dataclass(frozen=True, eq=False)
-class UnseenMode:
-    """A family of stage errors that the readings cannot separate from plate errors.
-
-    Attributes
-    ----------
-    name : str
-        Short name, such as ``non-orthogonality``.
-    text : str
-        The family in words.
-    example : float array (2, nx, ny)
-        One member, largest value 1, stage frame; empty for an angular family.
-    """
-
-    name: str
-    text: str
-    example: np.ndarray
 
 
 def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
@@ -310,80 +282,68 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     return bool(total - explained <= MATCH * scale)
 
 
-def unseen_modes(system: NormalEquations) -> Iterator[UnseenMode]:
-    """Yield the unseen families of a set of readings, the named ones first."""
+def unseen_modes(system: NormalEquations) -> Iterator[Finding]:
+    """Yield the families of stage errors that the readings cannot tell from errors of the plate."""
     grid, modes = system.grid, system.loose_modes
     if grid.n_views > 1:
         yield from _known_families(system)
     if len(modes):
-        yield UnseenMode("undetermined fields", f"{len(modes)} fields whose standard uncertainty "
-                         "exceeds ten times the noise of a reading", as_map(modes[0]))
+        yield Finding("undetermined_fields", details={"count": len(modes)})
     yield from _component_family(grid)
     missing = (grid.components.of_site < 0).reshape(grid.views.shape)
     if missing.any():
-        at = np.argwhere(missing)[0] - np.array(grid.views.shape) // 2
-        yield UnseenMode("sites never visited", f"{int(missing.sum())} sites that no mark reaches, "
-                         f"the first is ({at[0]}, {at[1]})", as_map(missing.astype(complex)))
+        yield Finding("sites_never_visited", details={
+            "count": int(missing.sum()), "first": _sites(missing, grid)[0]})
     if n := int((grid.components.of_mark < 0).sum()):
-        yield UnseenMode("marks never read", f"{n} marks of the plate that no view reads",
-                         np.zeros((0,)))
+        yield Finding("marks_never_read", details={"count": n})
     if system.angular.n_views:
         yield from _angular_families(system.angular)
 
 
-def _known_families(system: NormalEquations) -> Iterator[UnseenMode]:
+def _sites(chosen: np.ndarray, grid: GridSystem) -> list[list[int]]:
+    """Return the numbers (m, n) of chosen sites."""
+    return (np.argwhere(chosen) - np.array(grid.views.shape) // 2).tolist()
+
+
+def _known_families(system: NormalEquations) -> Iterator[Finding]:
     """Yield the unseen fields among the named ones."""
     z = system.grid.views.z_sites
     x, y = z.real, z.imag
-    for name, text, field in (
-            ("non-orthogonality", "non-orthogonality of the axes: Gx = O y, Gy = O x", y + 1j * x),
-            ("scale difference", "scale difference of the axes: Gx = R x, Gy = -R y", x - 1j * y),
-            ("bending along x", "steady turn from column to column: Gx = x y, Gy = -x^2/2",
-             x * y - 0.5j * x**2),
-            ("bending along y", "steady turn from row to row: Gx = y^2/2, Gy = -x y",
-             0.5 * y**2 - 1j * x * y)):
+    for name, field in (("nonorthogonality", y + 1j * x), ("scale_difference", x - 1j * y),
+                        ("bending_x", x * y - 0.5j * x**2), ("bending_y", 0.5 * y**2 - 1j * x * y)):
         if is_unseen(system, field):
-            yield UnseenMode(name, text, as_map(field))
+            yield Finding(name)
 
 
-def _component_family(grid: GridSystem) -> Iterator[UnseenMode]:
+def _component_family(grid: GridSystem) -> Iterator[Finding]:
     """Yield the family of vectors left free by balanced components, unless one spans all."""
     parts = grid.components
     free = np.flatnonzero(parts.balanced)
     if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
         return
     label = np.where((parts.of_site >= 0) & np.isin(parts.of_site, free), parts.of_site, -1)
-    label, phase = label.reshape(grid.views.shape), grid.free_turns[0]
-    signs = np.where(label >= 0, phase.reshape(label.shape), 0)
-    name, text = _shape_of(grid, label, n=len(free))
-    # the example: one component against the rest
-    yield UnseenMode(name, text, as_map(np.where(label == free[0], PHASES[signs], 0)))
+    yield _shape_of(grid, label.reshape(grid.views.shape), n=len(free))
 
 
-def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> tuple[str, str]:
-    """Name the pattern of the free components on the field."""
+def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> Finding:
+    """Return the pattern of the free components on the field."""
     shifts = {(pose.a, pose.b) for pose in grid.views.poses}
     turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
     if len(grid.views.poses) == 1:
-        return "every field", "everything: one view cannot separate the stage from the plate"
-    for axis, line in ((0, "rows"), (1, "columns")):
+        return Finding("every_field")
+    for axis, lines in ((0, "rows"), (1, "columns")):
         first = np.take(label, [label.shape[axis] // 2], axis=axis)
         if (label == first).all():
-            return (f"{line[:-1]} offsets",
-                    f"offsets of the {line} against each other, in x and in y"
-                    + (f", opposite in opposite {line}" if len(turns) > 1 else ""))
-    own = f"{2 * n - 2} numbers beside the datum"  # rotation and scale, or the translations
+            return Finding("line_offsets", details={"lines": lines, "opposite": len(turns) > 1})
+    beside_datum = 2 * n - 2  # rotation and scale, or the translations
     if len(shifts) == 1:
-        turn = "quarter" if any(t % 2 for t in turns) else "half"
-        return ("rotation-symmetric fields", f"rotation-symmetric fields: every field that a "
-                f"{turn} turn maps to itself ({own})")
-    period = _period(label)
-    if period:
-        along = " and ".join(f"every {p} pitches along {a}"
-                             for p, a in zip(period, "xy", strict=True) if p > 1)
-        return "periodic fields", f"patterns that repeat {along} ({own})"
-    return ("separate groups of sites", f"{n} groups of sites that no reading connects: "
-            f"each may move independently; the smallest is {_smallest(grid, label)}")
+        return Finding("rotation_symmetric", details={
+            "half": not any(t % 2 for t in turns), "numbers": beside_datum})
+    if period := _period(label):
+        return Finding("periodic_fields", details={"period": period, "numbers": beside_datum})
+    numbers, sizes = np.unique(label[label >= 0], return_counts=True)
+    return Finding("groups_of_sites", details={
+        "count": n, "smallest": _sites(label == numbers[np.argmin(sizes)], grid)})
 
 
 def _period(label: np.ndarray) -> tuple[int, int] | None:
@@ -400,47 +360,21 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
     return (out[0], out[1]) if max(out) > 1 else None
 
 
-def _smallest(grid: GridSystem, label: np.ndarray) -> str:
-    numbers, sizes = np.unique(label[label >= 0], return_counts=True)
-    at = np.argwhere(label == numbers[np.argmin(sizes)])
-    text = ", ".join(f"({m}, {n})" for m, n in at[:4] - np.array(grid.views.shape) // 2)
-    return text + (", ..." if len(at) > 4 else "")
-
-
-def _angular_families(angular: AngularSystem) -> Iterator[UnseenMode]:
-    """Yield the unseen modes of the angular map, in words."""
+def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
+    """Yield the unseen modes of the angular map."""
     if isinstance(angular, HarmonicSystem):
         if angular.missed:
-            *most, last = (str(number) for number in angular.missed)
-            numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
-            why = ("no view turns the lines" if angular.n_views < 2 else
-                   "every turn between views is a whole number of their periods, or nearly so")
-            yield UnseenMode("angular harmonics", f"angular map: harmonic{numbers}, as {why}",
-                             np.zeros((0,)))
+            yield Finding("harmonics_unseen", details={
+                "harmonics": [*map(int, angular.missed)], "turned": angular.n_views > 1})
         return
     parts = angular.components
-    n = len(parts.balanced)
-    if n > 1:
-        yield UnseenMode("angular groups", _angular_text(parts, n), np.zeros((0,)))
-    missing = int((parts.of_site < 0).sum())
-    if missing:
-        yield UnseenMode("lines never visited", f"{missing} angles of the stage that no line "
-                         "reaches", np.zeros((0,)))
-
-
-def _angular_text(parts: Components, n: int) -> str:
-    lines = np.arange(len(parts.of_site))
-    if np.array_equal(parts.of_site, parts.of_site[lines % n]):
-        if n == len(lines):
-            return "angular map: everything, as no view turns the lines"
-        return f"angular map: patterns that repeat every {n} lines"
-    return f"angular map: {n} groups of lines that no view connects"
-
-
-def as_map(field: np.ndarray) -> np.ndarray:
-    """Return a complex field (nx, ny) as (2, nx, ny), largest value 1."""
-    both = np.stack([field.real, field.imag]).astype(float)
-    return both / max(float(abs(both).max()), np.finfo(float).tiny)
+    n, lines = len(parts.balanced), np.arange(len(parts.of_site))
+    if n > 1 and np.array_equal(parts.of_site, parts.of_site[lines % n]):
+        yield Finding("periodic_lines", details={"period": n, "of": len(lines)})
+    elif n > 1:
+        yield Finding("groups_of_lines", details={"count": n})
+    if missing := int((parts.of_site < 0).sum()):
+        yield Finding("lines_never_visited", details={"count": missing})
 
 
 def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
-from selfcal_ros.blocks import block_of, blocks
+from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
@@ -32,6 +32,7 @@ from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumn
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.model.verdict import Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -843,14 +844,13 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     if not modes:
         return
     by_term = unseen_by_term(equations)
-    texts = tuple(f"{name}: {count} mode{'s' * (count != 1)} of the stage look like it"
+    alike = tuple(Finding("looks_like_stage", details={"term": name, "count": count})
                   for name, count in by_term.items())
-    advice = tuple(f"{name}: {block_of(name).cure}, or give it a size, as in {name}:SIZE"
-                   for name in by_term)
+    advice = tuple(Finding("separate_term", details={"term": name}) for name in by_term)
     free = int(equations.free.sum())
     found = replace(seen, unknowns=seen.unknowns + free, rank=seen.rank + free - modes,
-                    deficiency=seen.deficiency + modes, identifiable=False, modes=texts,
+                    deficiency=seen.deficiency + modes, identifiable=False, modes=alike,
                     advice=advice)
     raise NotIdentifiableError(
         f"the readings do not separate {' and '.join(by_term)} from the stage "
-        f"({modes} mode{'s' * (modes != 1)} undetermined): " + "; ".join(advice), found)
+        f"({modes} mode{'s' * (modes != 1)} undetermined)", found)

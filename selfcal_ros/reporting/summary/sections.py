@@ -332,8 +332,8 @@ def rejected_section(result: CalibrationResult) -> Section:
 def attention_section(result: CalibrationResult) -> Section:
     """Return unseen modes, advice and warnings, which require action."""
     seen = result.observability
-    lines = [f"undetermined mode: {printable(mode)}" for mode in seen.modes]
-    lines += [f"advice: {printable(advice)}" for advice in seen.advice]
+    lines = [f"undetermined mode: {printable(mode.text)}" for mode in seen.modes]
+    lines += [f"advice: {printable(advice.text)}" for advice in seen.advice]
     lines += [f"warning: {printable(warning)}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
 
@@ -342,7 +342,7 @@ def state_sentence(result: CalibrationResult) -> str:
     """Return the state of a calibration in one sentence."""
     seen, figures = result.observability, map_figures(result.error_map)
     if not seen.identifiable:
-        advice = f"; {printable(seen.advice[0])}" if seen.advice else ""
+        advice = f"; {printable(seen.advice[0].text)}" if seen.advice else ""
         return (f"Not a calibration: {counted(seen.deficiency, 'mode')} of the stage error cannot "
                 f"be determined from the marks that were read{advice}.")
     if not figures.n_known and not figures.n_lines_known:

@@ -13,6 +13,7 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words import phrases
+from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.units import (
     ARCSEC_PER_RAD,
@@ -388,6 +389,7 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     if result.recheck is not None and verdict.qualified:
         verdict = replace(verdict, sentence=phrases.recheck_sentence(result.recheck))
     return replace(result, verdict=verdict, findings=findings,
+                   observability=worded_observability(result.observability),
                    warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))
 

@@ -14,6 +14,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
+from selfcal_ros.reporting.words.observability import describe_view
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
@@ -26,7 +27,7 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     if add := why.details.get("add"):
         view = View("", add["rotation"], (add["translation_x"], add["translation_y"]),
                     add["grid"], add["angular"])
-        more = f"with {plan_check.describe_view(view, artifact)} measured as well it could be"
+        more = f"with {describe_view(view, artifact)} measured as well it could be"
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
@@ -151,7 +152,7 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
         return f"visit the marks in the order {step.order}" + "".join(
             f", {new} repeats for {old}" for old, new in sorted(pairs) if new != old)
     if step.repeat_of is None:
-        return "add " + plan_check.describe_view(step.view, plan.artifact)
+        return "add " + describe_view(step.view, plan.artifact)
     before = plan.views[step.repeat_of]
     return f"measure view '{before.name}' {step.view.repeats} times, not {before.repeats}"
 

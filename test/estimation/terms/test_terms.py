@@ -16,6 +16,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.options import bare
@@ -98,9 +99,9 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
     _, readings = measured(plan_of(order="raster", repeats=1), still, sigma_m=20e-9)
     with pytest.raises(NotIdentifiableError) as caught:
         calibrate(readings, bare(terms=parse_terms(["drift"], ""), drift_degree=1))
-    assert str(caught.value).startswith("the readings do not separate drift from the stage (2 "
-                                        "modes undetermined): drift: visit the marks in more "
-                                        "than one order")
+    assert str(told(caught.value)).startswith(
+        "the readings do not separate drift from the stage (2 modes undetermined): drift: visit "
+        "the marks in more than one order")
     assert caught.value.observability.deficiency == 2
     assert not caught.value.observability.identifiable
     u = {}

@@ -17,7 +17,15 @@ from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, Grade, ModelResult, TermEstimate, TermResult, Verdict
+from selfcal_ros.model.verdict import (
+    Cause,
+    Finding,
+    Grade,
+    ModelResult,
+    TermEstimate,
+    TermResult,
+    Verdict,
+)
 from selfcal_ros.reporting.summary.numbers import (
     aligned,
     arcsec,
@@ -41,8 +49,9 @@ from test.support.maps import random_map
 from test.support.results import known_result
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
-UNSEEN = Observability(5, 7, 2, False, ("non-orthogonality", "scale difference"),
-                       ("add a view turned by 90 deg",))
+UNSEEN = Observability(5, 7, 2, False, (Finding("", text="non-orthogonality"),
+                                        Finding("", text="scale difference")),
+                       (Finding("", text="add a view turned by 90 deg"),))
 
 
 def line_with(text, label):
