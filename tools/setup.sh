@@ -77,7 +77,7 @@ if ! fresh messages "$messages"; then
     MAKEFLAGS="-j$(nproc)" \
     AMENT_PREFIX_PATH="$venv" CMAKE_PREFIX_PATH="$venv" \
     "$venv/bin/colcon" --log-base "$build/colcon_log" build --base-paths msg_defs --build-base "$build" \
-    --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF \
+    --merge-install --install-base "$venv" --cmake-args -G Ninja -DBUILD_TESTING=OFF -DPYTHON_ONLY=ON \
     "-DPython3_EXECUTABLE=$venv/bin/python" --no-warn-unused-cli
   stamp messages "$messages"
 fi
