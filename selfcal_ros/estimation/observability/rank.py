@@ -14,6 +14,7 @@ move whole fields.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -391,18 +392,25 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     views : iterable of View
         Views of grid marks.
     """
-    poses = [view.pose for view in views]
-    steps = [(round(pose.turn_rad / (math.pi / 2), 9) % 4, complex(
-        *(round(shift / artifact.grid_pitch_m, 6) for shift in pose.shift_m))) for pose in poses]
-    turns = range(0, 4, 1 if artifact.shape[0] == artifact.shape[1] else 2)
-    forms = list(product((False, True), turns, turns)) if artifact.marks is None else [
-        (False, 0, 0)]
-    return min(tuple(sorted(_moved(q, shift, *form) for q, shift in steps)) for form in forms)
+    square, listed = artifact.shape[0] == artifact.shape[1], artifact.marks is not None
+    moved = []
+    for view in views:
+        turn = round(view.pose.turn_rad / (math.pi / 2), 9) % 4
+        shift = complex(*(round(step / artifact.grid_pitch_m, 6) for step in view.pose.shift_m))
+        moved.append(_forms(turn, shift, square=square, listed=listed))
+    return min(tuple(sorted(form)) for form in zip(*moved, strict=True))
 
 
-def _moved(q: float, shift: complex, mirror: bool, stage: int,
-           plate: int) -> tuple[float, float, float]:
-    if mirror:
-        q, shift = -q, shift.conjugate()
-    shift = shift * complex(PHASES[stage])
-    return (q + plate) % 4, shift.real + 0.0, shift.imag + 0.0
+@lru_cache(maxsize=1024)
+def _forms(turn: float, shift: complex, *, square: bool, listed: bool,
+           ) -> tuple[tuple[float, float, float], ...]:
+    """Return a view's turn and shift in each of the symmetries: thousands of plans share it."""
+    if listed:
+        return ((turn, shift.real + 0.0, shift.imag + 0.0),)
+    turns = range(0, 4, 1 if square else 2)
+    forms = []
+    for mirror, stage, plate in product((False, True), turns, turns):
+        q, by = (-turn, shift.conjugate()) if mirror else (turn, shift)
+        by = by * complex(PHASES[stage])
+        forms.append(((q + plate) % 4, by.real + 0.0, by.imag + 0.0))
+    return tuple(forms)
