@@ -171,8 +171,7 @@ SENTENCES: dict[str, Words] = {
     "lines_sign_not_shown": lambda f, of: (
         "nothing in the readings shows the sign of offset_theta, and with the other sign the "
         "angular map would be that of a different stage: turn the plate by 0.1 mrad or more "
-        "between the views, have the stage stop beside the lines deliberately, or declare the "
-        "microscope (--microscope 0.01)"),
+        "between the views, or declare the microscope (--microscope 0.01)"),
     "scale_of_offsets": lambda f, of: (
         f"offsets along {f.axis} are {f.size:.3f} ± {f.u:.3f} to {of['most']:.3f} times what the "
         f"stage moves among repeats, but the scale is taken as 1 ± {of['u_scale']:.3g}: correct "
