@@ -653,8 +653,9 @@ class SizeTest:
         Its size, SI unit of the term; the largest one of a microscope.
     shown, allowed : float
         The size shown by the readings, and the largest that they allow: the upper one of two limits
-        with a coverage of 95.45 % if they contradict the given size, the limit of `DOUBT_LEVEL` if
-        they make it doubtful; otherwise the given size.
+        with a coverage of 95.45 % if they contradict the given size; the limit of `DOUBT_LEVEL` if
+        they make it doubtful, beyond what is plausible no more than `shown`; otherwise the given
+        size.
     statistic : float
         b' (C + size^2 1)^-1 b of all coefficients; `rank` on average.
     rank : int
@@ -751,6 +752,8 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
 
     tail = TAIL if test.contradicted else DOUBT_LEVEL
     shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
+    if not test.contradicted:  # the limit of few coefficients is far above what they show
+        allowed = min(allowed, max(term.size, term.block.plausible, shown))
     wider = float(np.log(variances(shown) / variances(term.size)).sum())
     return replace(test, shown=shown, allowed=allowed,
                    evidence=float(found - statistic(shown) - wider) / 2)

@@ -103,7 +103,7 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, found.solved.joint.sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
-              if test.contradicted and test.name not in found.terms}
+              if (test.contradicted or not _is_plausible(test)) and test.name not in found.terms}
     names = [name for name, cause in raised.items() if cause is not None]
     found.bounded &= not any(_beyond_u(solved, test) for test in tests)
     plausible = all(map(_is_plausible, tests))
@@ -305,8 +305,11 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
 
 
 def _is_plausible(test: SizeTest) -> bool:
-    """Return whether a machine may have a term of the size that the readings allow."""
-    return test.allowed <= block_of(test.name).plausible
+    """Return whether a machine may have a term of the size that the readings allow.
+
+    Or of the one that is declared.
+    """
+    return test.allowed <= max(test.given, block_of(test.name).plausible)
 
 
 def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
@@ -352,7 +355,8 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
                   if term.block.of_offsets and not term.free), None)
     if known is None:
         return False
-    wider = known.scaled(max(known.block.plausible / known.size, 1.0))
+    # so wide that it need not share with a doubtful rotation what it explains by itself
+    wider = known.scaled(max(BEYOND * known.block.plausible / known.size, 1.0))
     twin = solved_with(measurements, options, [wider])
     if twin is None or any(test.contradicted for test in twin.joint.sizes):
         return False
@@ -361,8 +365,10 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
     if not _counts(replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
                    found.solved):
         return False
-    found.causes.append(cause_of(held, twin.joint.problem.ground))
+    cause = cause_of(held, twin.joint.problem.ground)
+    found.causes.append(cause)
     found.effects.append(effect)
+    found.bounded &= not abs(cause.size) > max(known.size, known.block.plausible)
     return True
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
@@ -162,6 +163,25 @@ def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
             raised.append(test.allowed / test.given)
             assert term.size_used == test.allowed and result.verdict.grade is Grade.GOOD
     assert raised and min(raised) > 1
+
+
+@pytest.mark.parametrize(("plausible", "grade"), [(4.0, Grade.GOOD), (0.5, Grade.NOT_QUALIFIED)])
+def test_doubt_raises_no_size_beyond_what_is_plausible_or_shown(monkeypatch, plausible, grade):
+    """What the readings show beyond what is plausible is a fault, though it be only doubtful."""
+    size, seen = SIZES["plate_scale"], 0
+    monkeypatch.setitem(blocks(), "plate_scale", replace(
+        blocks()["plate_scale"], plausible=plausible * size))
+    for seed in range(8):
+        _, readings = measured(seed, {"plate_scale": 3 * size})
+        (test,) = fitted(readings, options(f"plate_scale:{size}")).sizes
+        if 5e-4 < test.p < 0.1:
+            seen += 1
+            assert size < test.shown < 4 * size
+            assert test.allowed < 1.000001 * max(test.shown, plausible * size)
+            verdict = calibrate(readings, options(f"plate_scale:{size}")).verdict
+            assert verdict.grade is grade
+            assert bool(verdict.causes) is (grade is Grade.NOT_QUALIFIED)
+    assert seen
 
 
 def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():

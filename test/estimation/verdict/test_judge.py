@@ -198,3 +198,16 @@ def test_the_origin_is_from_the_first_exposure_to_the_last():
                   for name in ("first_exposure", "last_exposure"))
     assert begin == pytest.approx(int(stamps.min()) * 1e-9, abs=1e-3)
     assert end - begin == pytest.approx(span_s, abs=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_microscope_of_an_implausible_scale_does_not_pass_for_a_turn_of_the_lines(seed):
+    """Lines turn against marks in each view by as much as the plate: its scale is 20 % wrong."""
+    rng, plan = np.random.default_rng(seed), hu_plan(Artifact(11, 0.01, 24), repeats=5)
+    how = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=np.deg2rad(0.001), servo_sigma_m=20e-9,
+                       servo_sigma_theta_rad=1e-7)
+    spread = Spread(phi_rad=np.deg2rad(0.01), t_m=5e-6, microscope_scale=0.2)
+    truth = random_truth(plan.artifact, 4, rng, spread)
+    verdict = calibrate(simulate_measurements(truth, plan, rng, settings=how, visits=True)).verdict
+    assert verdict.grade is Grade.NOT_QUALIFIED
+    assert "microscope" in [cause.name for cause in verdict.causes]
