@@ -20,6 +20,9 @@ UNTOLD = 0.3
 """Effect in standard uncertainties of the map, rms, from which a term that the readings do not
 determine is assumed in its nominal size."""
 
+TIMES = 3
+"""How many times larger than assumed an effect is taken to show what U owes to the assumption."""
+
 SMALLEST, LARGEST = 1e-18, 1.0
 """Valid sizes of terms in texts."""
 

@@ -32,6 +32,7 @@ from selfcal_ros.estimation.joint.solve import (
     KEY,
     MAX_FULL,
     OF_OFFSETS,
+    OF_PLATE,
     factors_of,
     kept_numbers,
     not_kept,
@@ -369,6 +370,14 @@ class Together:
         kept = self.result.extra.get(KEY, {}).get(BESIDE, {"with_map": 0})
         return factors_of(self.result)[int(kept["with_map"]):]
 
+    @cached_property
+    def _effects_on_plate(self) -> np.ndarray:
+        """What they add to the variance of the plate's map, for unit noise, (2, nx, ny)."""
+        shape = (2, *self.marks.shape)
+        if not len(self._effects):
+            return np.zeros(shape)
+        return kept_numbers(self.result.extra[KEY], OF_PLATE, shape, KEY, "no effects on the plate")
+
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
         plate, stage = self._kept("plate", (2, *marks.shape)), factors_of(self.result)
@@ -413,7 +422,7 @@ class Together:
         effects = factors[terms:]
         cover += effects.T @ effects
         if len(effects):
-            cover[range(s, s + m), range(s, s + m)] += (self._effects**2).sum(axis=0).mean()
+            cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[:, marks].ravel()
         return cover * self.result.noise.sigma_xy**2
 
     @cached_property
@@ -436,6 +445,7 @@ class Together:
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
         white += (self._kept("plate", (2, *known.shape))[..., known] ** 2).sum()
         found = (plate.u_ax[known] ** 2 + plate.u_ay[known] ** 2).sum()
+        found -= self._effects_on_plate[:, known].sum() * self.result.noise.sigma_xy**2
         return float(found / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
 
     def lines(self) -> tuple[np.ndarray, np.ndarray]:

@@ -138,16 +138,20 @@ class ModelFit:
         if self.equations is None:
             return None
         now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
-        grid, fit, columns, lines = (self.problem.system.grid, now.projected, now.columns.grid,
-                                     now.columns.lines)
-        on_lines = np.zeros((now.n, *self.problem.system.angular.weight.shape))
-        if len(lines.at):
-            on_lines[lines.at] = lines.values
-        plates = [grid.plate(*one)[0].ravel() for one in zip(
-            columns, fit.fields.T.reshape(-1, *grid.views.shape),
-            fit.parameters[:3 * grid.n_views].T, strict=True)]
-        return TermSpread(columns, on_lines, fit.fields, np.array(plates).T, fit.parameters,
-                          fit.turned, now.inverse(self.found.xy.sigma))
+        return spread_of(now, now.inverse(self.found.xy.sigma))
+
+
+def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
+    """Return what coefficients with a covariance, (p, p) for unit noise, do to the maps."""
+    system, fit, columns = equations.system, equations.projected, equations.columns
+    on_lines = np.zeros((equations.n, *system.angular.weight.shape))
+    if len(columns.lines.at):
+        on_lines[columns.lines.at] = columns.lines.values
+    plates = [system.grid.plate(*one)[0].ravel() for one in zip(
+        columns.grid, fit.fields.T.reshape(-1, *system.grid.views.shape),
+        fit.parameters[:3 * system.grid.n_views].T, strict=True)]
+    return TermSpread(columns.grid, on_lines, fit.fields, np.array(plates).T, fit.parameters,
+                      fit.turned, covariance)
 
 
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:

@@ -18,12 +18,14 @@ from selfcal_ros.estimation.joint.solve import (
     ANGULAR_KEY,
     KEY,
     MAX_FULL,
+    OF_PLATE,
     rounded,
     variance_of_terms,
 )
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult, Noise
+from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
 
 TOLD = 0.5
@@ -46,11 +48,14 @@ class Effect:
         Effect on Gx and Gy, m.
     theta : float array (K,)
         Effect on Gtheta, rad.
+    plate : float array (2, nx, ny), optional
+        Effect on Ax and Ay, m; if it is not known each mark has the rms of that on the stage.
     """
 
     name: str
     xy: np.ndarray
     theta: np.ndarray
+    plate: np.ndarray | None = None
 
     @property
     def unit(self) -> str:
@@ -88,14 +93,17 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     effects = [effect for effect in effects if effect.xy.any() or effect.theta.any()]
     if not effects:
         return result
-    emap, extra = result.error_map, dict(result.extra)
+    emap, plate, extra = result.error_map, result.artifact_map, dict(result.extra)
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
+    of_plate = sum((np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
+                    for effect in effects), np.zeros((2, *plate.ax.shape)))
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
         kept = extra.get(KEY, {"terms": [], "factors": []})
         factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
         extra[KEY] = {**kept, "terms": [*kept["terms"], *(effect.name for effect in effects)],
-                      "factors": [*kept["factors"], *factors]}
+                      "factors": [*kept["factors"], *factors], OF_PLATE: rounded(
+                          of_plate / result.noise.sigma_xy**2).tolist()}
     turned = dict(extra.get(ANGULAR_KEY, {}))
     for effect in effects:
         if effect.theta.any():
@@ -104,7 +112,10 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
         extra[ANGULAR_KEY] = turned
     emap = replace(emap, u_gx=np.sqrt(emap.u_gx**2 + power[0]),
                    u_gy=np.sqrt(emap.u_gy**2 + power[1]), u_g_theta=u_theta)
-    return replace(result, error_map=emap, extra=extra)
+    if plate.u_ax.size:
+        plate = replace(plate, u_ax=np.sqrt(plate.u_ax**2 + of_plate[0]),
+                        u_ay=np.sqrt(plate.u_ay**2 + of_plate[1]))
+    return replace(result, error_map=emap, artifact_map=plate, extra=extra)
 
 
 def enlargements(result: CalibrationResult, names: Iterable[str],
@@ -180,6 +191,12 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
 INTERPOLATION = "interpolation"
 """The component that only a map used between its nodes or lines has."""
 
+OWED = 0.1
+"""Share of u^2 from which an assumption is named."""
+
+TERM = "term "
+"""Beginning of the component of a term of the model."""
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -228,6 +245,18 @@ class Budget:
     def U_max(self) -> float:
         """Expanded uncertainty at the worst node; anywhere, at most."""
         return self.k * self.u_max
+
+    @property
+    def assumptions(self) -> tuple[BudgetLine, ...]:
+        """Lines that matter of default terms that the readings do not determine."""
+        return tuple(line for line in self.lines if line.source == "default" and (
+            line.component.startswith(TERM) and line.effect_rms**2 > OWED * self.u_rms**2))
+
+    @property
+    def U_max_if_larger(self) -> float:
+        """`U_max`, at most, if what is assumed were `TIMES` as large."""
+        more = (TIMES**2 - 1) * sum(line.effect_max**2 for line in self.assumptions)
+        return self.k * float(np.sqrt(self.u_max**2 + more))
 
 
 def budgets(result: CalibrationResult) -> list[Budget]:
@@ -314,7 +343,7 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         cause = next((cause for cause in result.verdict.causes if cause.name == name), None)
         if cause is None and name in blocks():  # not determined by the readings
             block = block_of(name)
-            return BudgetLine(quantity, f"term {name}", "B", np.nan, block.nominal, block.unit,
+            return BudgetLine(quantity, TERM + name, "B", np.nan, block.nominal, block.unit,
                               *effect, np.inf, "default", {"given": block.nominal})
         value, u_value, unit = (np.nan, np.nan, "m") if cause is None else (
             cause.size, cause.u, cause.unit)
@@ -324,7 +353,7 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
     told = part < TOLD
     largest = max(term.estimates, key=lambda each: abs(np.nan_to_num(each.value)))
     return BudgetLine(
-        quantity, f"term {name}", "A" if told else "B", largest.value, largest.u, largest.unit,
+        quantity, TERM + name, "A" if told else "B", largest.value, largest.u, largest.unit,
         *effect, _dof(result.noise, quantity) if told else np.inf,
         "readings" if told or term.size_used else term.source,
         {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": part})

@@ -6,10 +6,12 @@ readings determine such an effect it adds nothing.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.joint.model_fit import equations_of
+from selfcal_ros.estimation.datum.covariance import MapsCovariance
+from selfcal_ros.estimation.joint.model_fit import equations_of, spread_of
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE
 from selfcal_ros.estimation.joint.solve import Solved
 from selfcal_ros.estimation.options import Options
@@ -21,7 +23,7 @@ from selfcal_ros.model.terms import UNTOLD, nominal_terms
 
 
 def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
-    """Yield what terms outside the model, each in its nominal size, would add to u of the XY map.
+    """Yield what terms outside the model, each in its nominal size, would add to u of the XY maps.
 
     One for each independent combination of their coefficients: what the readings determine of a
     term is not part of that. None of terms that would hardly add anything.
@@ -38,30 +40,43 @@ def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
         return
     if not solved.result.has_uncertainty or not np.isfinite(model.found.xy.sigma):
         return
-    problem = model.problem
+    problem, found = model.problem, model.found
     known = {term.name for term in (*options.terms, *problem.terms)}
     visited = all(visits is not None for visits in problem.ground.visits)
     more = nominal_terms(known, visits=visited)
     if not more:
         return
     columns = term_columns(problem.ground, (*problem.terms, *more))
-    equations = equations_of(problem, model.found, columns)
+    equations = equations_of(problem, found, columns)
+    maps = MapsCovariance(
+        problem.system, found.inverse, options.reference, half_width_m=problem.half_width_m,
+        terms=spread_of(equations, np.zeros((equations.n,) * 2))).maps_of_terms()
+    both = np.concatenate([part for values in maps for part in (values.real, values.imag)])
+    count = 2 * problem.system.grid.n_sites
     least = UNTOLD * rms(emap.u_xy)
     for term in more:
-        fields = _added(equations, columns.rows([term.name]), model.covariance,
-                        model.found.xy.sigma)
-        if np.sqrt((abs(fields) ** 2).sum(axis=0).mean() / 2) > least:
-            lines = np.zeros(len(emap.g_theta))
-            for field in fields:
-                yield effect_of_field(str(term.name), field, solved.result.sense, lines)
+        added = _added(equations, both, columns.rows([term.name]), held=model.covariance,
+                       sigma=found.xy.sigma)
+        if np.sqrt((added[:count]**2).sum(axis=1).mean()) > least:
+            for each in added.T:
+                yield _effect(str(term.name), each, solved)
 
 
-def _added(equations: TermEquations, rows: np.ndarray, held: np.ndarray,
+def _effect(name: str, both: np.ndarray, solved: Solved) -> Effect:
+    """Return the effect on Gx, Gy, Ax, Ay, one after the other, in the frame of the equations."""
+    emap, plate = solved.result.error_map, solved.result.artifact_map
+    stage, of_plate = np.split(both, [2 * emap.gx.size])
+    x, y = stage.reshape(2, *emap.gx.shape)
+    found = effect_of_field(name, x + 1j * y, solved.result.sense, np.zeros(len(emap.g_theta)))
+    return replace(found, plate=of_plate.reshape(2, *plate.ax.shape))
+
+
+def _added(equations: TermEquations, maps: np.ndarray, rows: np.ndarray, *, held: np.ndarray,
            sigma: float) -> np.ndarray:
-    """Return what the columns `rows` add to the map, independent and of size 1, (c, nx, ny), m.
+    """Return what the columns `rows` add to both maps, independent and of size 1, (n, c), m.
 
     With C = `held` the covariance of the model's own coefficients, which come first, M the
-    information and F the maps of the columns, their squares add up to
+    information and F the `maps` (n, p) of the columns, their squares add up to
     (F_t - F C M_t) (M_tt + 1/size^2 - M_t' C M_t)^-1 (F_t - F C M_t)'.
     """
     own = slice(len(held))
@@ -71,11 +86,6 @@ def _added(equations: TermEquations, rows: np.ndarray, held: np.ndarray,
     left = left * np.outer(size, size) + max(sigma, LEAST_NOISE_M) ** 2 * np.eye(len(size))
     values, vectors = np.linalg.eigh((left + left.T) / 2)
     root = size[:, None] * vectors * sigma / np.sqrt(np.maximum(values, LEAST_NOISE_M**2))
-    moved = (equations.maps[:, rows] - equations.maps[:, own] @ couple) @ root
-    moved[~equations.system.known_sites.ravel()] = 0.0
-    both = np.concatenate([moved.real, moved.imag])
-    left_maps, sizes, _ = np.linalg.svd(both, full_matrices=False)
-    kept = (left_maps * sizes)[:, sizes > NEGLIGIBLE * sizes.max(initial=0.0)].T
-    nodes = len(moved)
-    return (kept[:, :nodes] + 1j * kept[:, nodes:]).reshape(
-        -1, *equations.system.known_sites.shape)
+    moved = (maps[:, rows] - maps[:, own] @ couple) @ root
+    left_maps, sizes, _ = np.linalg.svd(moved, full_matrices=False)
+    return (left_maps * sizes)[:, sizes > NEGLIGIBLE * sizes.max(initial=0.0)]

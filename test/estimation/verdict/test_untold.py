@@ -9,13 +9,16 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes, rms
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.reporting.words.phrases import line_text
 from selfcal_ros.simulation.cell import CellSettings
+from test.support.dense_terms import SIGMA, Dense
 from test.support.options import BARE
+from test.support.plans import plan_of
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
 PLATE = Artifact(9, 0.01, 24)
@@ -102,3 +105,30 @@ def test_a_drift_of_the_assumed_size_lies_in_u():
             ratios.setdefault(size, []).append((error / u_of(result)).ravel())
     with_it, without = (np.sqrt(np.mean(np.square(found))) for found in ratios.values())
     assert with_it < 1.1 < without
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_the_plate_has_its_share_of_a_drift_that_one_pass_hides(sense):
+    """Its u is that of one dense least squares of all visits with the drift in its size."""
+    readings, _ = measured(repeats=1, sense=sense)
+    none = (*parse_terms(["microscope:0", "plate_strain:0", "approach:0", "rotation:0",
+                          "line_eccentricity:0"], "test"), ModelTerm("plate_shape", 5e-9))
+    hidden, without = (calibrate(readings, Options(terms=(*none, *drift)))
+                       for drift in ((), (replace(DRIFT, size=0.0),)))
+    dense = Dense(plan_of("0, 90, tx", 9), Assumed(SIGMA, order="serpentine"), sense)
+    sized = [replace(term, size=term.size * SIGMA / hidden.noise.sigma_xy)
+             for term in (none[-1], DRIFT)]  # against the noise of `Dense`
+    stage, of_plate = np.split(dense.solver(sized)[0][:4 * PLATE.m.size], 2)
+    z = (PLATE.m + 1j * PLATE.n).ravel()
+    modes = np.stack([np.ones(z.shape), 1j * np.ones(z.shape), 1j * z])
+    modes = np.stack([modes.real, modes.imag], axis=-1).reshape(3, -1).T
+    basis = np.linalg.qr(modes)[0]
+    of_plate = of_plate - basis @ (basis.T @ of_plate)
+    scale = np.stack([z.real, z.imag], axis=-1).ravel()
+    # what the datum takes off the stage as its scale, the plate has
+    of_plate = of_plate + np.outer(scale, scale @ stage / (scale @ scale))
+    wanted = hidden.noise.sigma_xy * np.sqrt((of_plate**2).sum(axis=1)).reshape(*PLATE.m.shape, 2)
+    found, less = (np.stack([each.artifact_map.u_ax, each.artifact_map.u_ay], axis=-1)
+                   for each in (hidden, without))
+    np.testing.assert_allclose(found, wanted, rtol=0.03)
+    assert rms(less) < 0.95 * rms(found)
