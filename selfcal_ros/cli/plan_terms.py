@@ -186,7 +186,8 @@ def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, A
                            "lines": lines}
     for quantity in dict.fromkeys(line.quantity for line in budget.lines):
         out |= {f"U_{quantity}": 2 * budget.u_rms(quantity),
-                f"U_{quantity}_noise": 2 * budget.u_rms(quantity, noise_only=True)}
+                f"U_{quantity}_noise": 2 * budget.u_rms(quantity, noise_only=True),
+                f"U_{quantity}_if_larger": 2 * budget.u_rms(quantity, if_larger=True)}
     return out
 
 

@@ -172,7 +172,9 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     assert main(asked) == 0
     text = capsys.readouterr().out
     assert "%  add check_stops: {marks: 5, offset: 20e-6}: " in text
-    assert "from noise alone 35.6 nm" in text
+    larger = found["U_xy_if_larger"]
+    assert 2 * found["U_xy"] < larger < 3 * found["U_xy"]
+    assert f"from noise alone 35.6 nm; {larger * 1e9:.3g} nm if all that is assumed" in text
     assert main([*asked, "--model", "none", "--json"]) == 0
     assert [line["component"] for line in json.loads(capsys.readouterr().out)["budget"][
         "lines"]] == ["reading noise"]

@@ -51,7 +51,7 @@ from selfcal_ros.estimation.terms.planned import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import UNTOLD, ModelTerm, nominal_terms
+from selfcal_ros.model.terms import TIMES, UNTOLD, ModelTerm, nominal_terms
 from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 
@@ -312,15 +312,18 @@ class PlanBudget:
         Of the XY map and, if lines are measured, of the angular map.
     removals : dict
         Removal of the line of each (quantity, component) that matters.
+    if_larger : tuple of BudgetLine
+        The lines if all that is assumed by default were `TIMES` as large.
     """
 
     lines: tuple[BudgetLine, ...]
     removals: Mapping[tuple[str, str], Removal]
+    if_larger: tuple[BudgetLine, ...] = ()
 
-    def u_rms(self, quantity: str, *, noise_only: bool = False) -> float:
+    def u_rms(self, quantity: str, *, noise_only: bool = False, if_larger: bool = False) -> float:
         """Return the standard uncertainty, rms over the map; NaN without such a map."""
-        parts = [line.effect_rms for line in self.lines if line.quantity == quantity
-                 and (line.component == NOISE or not noise_only)]
+        parts = [line.effect_rms for line in (self.if_larger if if_larger else self.lines)
+                 if line.quantity == quantity and (line.component == NOISE or not noise_only)]
         return float(np.sqrt(np.sum(np.square(parts)))) if parts else float("nan")
 
     def share(self, line: BudgetLine) -> float:
@@ -351,7 +354,9 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
     if more := _untold(budget, plan, terms, assumed, asked=asked):
         terms = [*terms, *more]
         budget = _budget(plan, terms, assumed, alone, asked=asked)
-    return replace(budget, removals=_removals(budget, plan, terms, assumed))
+    larger = [term if term.name in asked else term.scaled(TIMES) for term in terms]
+    return replace(budget, removals=_removals(budget, plan, terms, assumed), if_larger=_budget(
+        plan, larger, assumed, alone, asked=asked).lines)
 
 
 def _budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, alone: Prediction, *,

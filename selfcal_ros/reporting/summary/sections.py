@@ -35,7 +35,7 @@ from selfcal_ros.reporting.summary.numbers import (
     truth_figures,
     um,
 )
-from selfcal_ros.reporting.words.findings import unit_of
+from selfcal_ros.reporting.words.findings import assumption_text, unit_of
 from selfcal_ros.reporting.words.phrases import counted_views, dof_text, of_few_read
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, RAD_PER_MRAD, UM_PER_M
 
@@ -349,8 +349,9 @@ def state_sentence(result: CalibrationResult) -> str:
         return "No calibration: no site of the error map is known."
     k = result.noise.k_theta
     text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
-    if result.verdict.grade is Grade.GOOD:
-        return f"{result.verdict.sentence}. {text}" if result.recheck is not None else text
+    if result.verdict.grade is Grade.GOOD and result.recheck is None:
+        assumed = assumption_text(result)
+        return text + f" {assumed}." * bool(assumed)
     said = printable(result.verdict.sentence).rstrip(".")
     return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
 
@@ -378,6 +379,8 @@ def state_line(result: CalibrationResult) -> str:
 
     if result.recheck is not None and verdict.qualified:
         return f"{verdict.sentence}: {line}."
+    if assumed := assumption_text(result) if verdict.qualified else "":
+        line = f"{line}; {assumed}"
     if verdict.grade is Grade.GOOD:
         return f"Good: {line}."
     lead = "Good within an enlarged U" if verdict.qualified else "Not qualified"

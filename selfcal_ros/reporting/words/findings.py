@@ -10,8 +10,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from selfcal_ros.blocks import blocks
+from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
-from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.model.terms import TIMES
+from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -383,6 +385,9 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     new = (found.text for found, old in zip(findings, result.findings, strict=True)
            if not old.text)
     verdict = worded_verdict(result.verdict, result.noise)
+    assumed = assumption_text(result) if verdict.qualified and not result.verdict.sentence else ""
+    if assumed:
+        verdict = replace(verdict, sentence=f"{verdict.sentence}; {assumed}")
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
         verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
     if result.recheck is not None and verdict.qualified:
@@ -391,6 +396,38 @@ def worded(result: CalibrationResult) -> CalibrationResult:
                    observability=worded_observability(result.observability),
                    warnings=(*result.warnings, *new), budget=tuple(
                        replace(line, text=line.text or line_text(line)) for line in result.budget))
+
+
+_ASSUMED = {
+    "microscope": "a microscope known to {}",
+    "drift": "a drift of {} within a view",
+    "plate_shape": "a plate that bends by {} from view to view",
+    "plate_strain": "a plate strained by {} from view to view",
+    "approach": "an indicated position that changes by {} with the direction of approach",
+    "line_eccentricity": "a circle of lines {} of its radius off the axis",
+    "rotation": "lines that turn by {} against the marks from view to view",
+    "yaw": "a stage that yaws by {}"}
+"""What is assumed of a term, given its size."""
+
+
+def assumption_text(result: CalibrationResult) -> str:
+    """Return what U owes to sizes that are assumed and not shown by the readings; or nothing."""
+    texts = []
+    for budget in budgets(result) if result.budget else []:
+        if budget.anywhere or not budget.assumptions:
+            continue
+        what = " and ".join(map(_assumed, budget.assumptions))
+        unit, of = (UM, "U") if budget.quantity == "xy" else (ARCSEC, "U of θ")
+        texts.append(f"{of} assumes {what}, which the readings do not show: {TIMES} times as much "
+                     f"would make it up to {budget.U_max_if_larger * unit.per_si:.3g} {unit.name}")
+    return "; ".join(texts)
+
+
+def _assumed(line: BudgetLine) -> str:
+    name = line.component.removeprefix(TERM)
+    unit = PERCENT if name == "microscope" else unit_of(name, line.unit)
+    size = f"{line.details['given'] * unit.per_si:.3g} {unit.name} (k=1)"
+    return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 
 
 def _with_text[Kind: Finding](found: Kind) -> Kind:

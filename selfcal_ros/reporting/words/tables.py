@@ -11,6 +11,7 @@ from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
@@ -120,8 +121,10 @@ def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
         if lines:
             whole, noise = (2 * factor * budget.u_rms(quantity, noise_only=only)
                             for only in (False, True))
-            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone "
-                       f"{noise:.3g} {unit}")
+            larger = 2 * factor * budget.u_rms(quantity, if_larger=True)
+            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone {noise:.3g} "
+                       f"{unit}; {larger:.3g} {unit} if all that is assumed were {TIMES} times "
+                       "as large")
     return out
 
 

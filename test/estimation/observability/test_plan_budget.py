@@ -137,12 +137,23 @@ def test_a_removal_leaves_what_it_says():
     assert 0.5 < ratio < module.REMOVED
 
 
+def test_a_larger_assumption_changes_what_the_readings_leave_of_it_and_nothing_declared():
+    plan, assumed = plan_of("0, 90, tx", 5, repeats=2), Assumed(1e-9, order="x_back_y_back")
+    terms = parse_terms(["plate_strain:7e-8", "plate_shape:5e-9"], "")
+    larger = parse_terms(["plate_strain:7e-8", "plate_shape:15e-9"], "")
+    found = budget_of(plan, terms, assumed, asked=["plate_strain", "drift", "approach"])
+    wanted = budget_of(plan, larger, assumed, asked=["plate_strain", "drift", "approach"])
+    assert found.u_rms("xy", if_larger=True) == pytest.approx(wanted.u_rms("xy"), rel=1e-9)
+    assert found.u_rms("xy", if_larger=True) > 2 * found.u_rms("xy")
+
+
 def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     sizes = []
     monkeypatch.setattr(module, "effects_of_terms", lambda plan, *more: (
         sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1])
     found = budget_of(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
-    assert sizes[:3] == [(15, 15)] * 3 and set(sizes[3:]) == {(11, 11)}  # with the drift
+    # with the drift, and with larger sizes
+    assert sizes.count((15, 15)) == 4 and set(sizes) == {(15, 15), (11, 11)}
     before = effects_of_terms(plan_of("0, 90, tx", 15), [
         *default_terms(), ModelTerm("drift", 10e-9)], Assumed(1e-9))
     assert effects(found)["microscope"] == pytest.approx(np.sqrt(before["microscope"][0].mean()))

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
+from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import (
     Cause,
     Finding,
@@ -45,6 +47,7 @@ from selfcal_ros.reporting.summary.sections import (
     state_sentence,
     summary_text,
 )
+from selfcal_ros.reporting.words.findings import assumption_text, worded
 from test.support.maps import random_map
 from test.support.results import known_result
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
@@ -56,6 +59,24 @@ UNSEEN = Observability(5, 7, 2, False, (Finding("", text="non-orthogonality"),
 
 def line_with(text, label):
     return next(line for line in text.splitlines() if line.strip().startswith(label))
+
+
+def test_every_first_sentence_says_what_u_owes_to_a_size_that_is_assumed():
+    plan, rng = hu_plan(Artifact(7, 0.01, 8), repeats=3), np.random.default_rng(4)
+    truth = random_truth(plan.artifact, len(plan.views), rng)
+    readings = simulate_measurements(truth, plan, rng, sigma_m=5e-9, sigma_theta_rad=1e-6)
+    found = worded(calibrate(readings))
+    assumed = assumption_text(found)
+    assert assumed.startswith("U assumes a plate that bends by 0.005 µm (k=1) from view to view")
+    for text in (state_sentence(found), state_line(found), found.verdict.sentence,
+                 worded(result_from_dict(result_to_dict(found), "file")).verdict.sentence):
+        assert text.count("assumes a plate that bends") == 1, text
+    # a solution with the larger size has no larger U, and hardly a smaller one
+    larger = calibrate(readings, Options(terms=parse_terms(["plate_shape:15e-9"], "test")))
+    told = float(re.search(r"times as much would make it up to ([\d.]+) µm", assumed)[1])
+    assert 1 <= told / (larger.noise.k_xy * np.nanmax(larger.error_map.u_xy) * 1e6) < 1.15
+    # what a user declares is no assumption of ours
+    assert "bends" not in assumption_text(worded(larger))
 
 
 def small_map(gx, gy, u=1e-8, g_theta=(), u_theta=1e-7):
