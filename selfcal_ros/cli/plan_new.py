@@ -382,7 +382,8 @@ def _mark_size_m(known: Known) -> float:
 def _simulation(known: Known, plan: str) -> dict[str, Any]:
     """Return SIM.yaml of the simulated machine."""
     out: dict[str, Any] = {"plan": plan, "seed": 1,
-                           "truth": {"t": min(3e-5, known.pitch / 20)},  # error of the placing
+                           "truth": {"t": min(3e-5, known.pitch / 20),  # error of the placing
+                                     "correlation": 4},  # pitches: a smooth stage, as stages are
                            "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6}}
     if any(known.field):
         pixel_m = _mark_size_m(known) / PIXELS_A_MARK

@@ -109,7 +109,8 @@ MEASURED = {
              "repeatability_arcsec": 0.5, "plate": ["o" * 20 + "."] + ["o" * 21] * 20,
              "plate_step": 1, "missing_lines": [0, 2, 4, 5, 7]},
     "summary": {"state": "Calibrated from 4 views: largest error 0.713 µm at x 30 mm, y 50 mm, "
-                         "every site known to ±0.0483 µm or better (k=2.01).",
+                         "every site known to ±0.0483 µm, any place to ±0.0502 µm or better "
+                         "(k=2.01).",
                 "views": [4, 4], "identifiable": True, "qualified": True, "enlarged": False,
                 "max_error_um": 0.713, "rms_uncertainty_um": 0.0176, "advice": [], "causes": [],
                 "run_id": "17"},

@@ -222,13 +222,18 @@ def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
 def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
     """Return u rms, u at most and U at most of a coordinate anywhere in the field, m.
 
-    NaN without an uncertainty map.
+    NaN without an uncertainty map, and with damaged factors of its covariance.
     """
     from selfcal_ros.estimation.verdict.uncertainty import budgets  # with scipy, not for figures
 
-    found = (budget for budget in budgets(result) if budget.quantity == "xy" and budget.anywhere)
-    budget = next(found, None)
-    return (math.nan,) * 3 if budget is None else (budget.u_rms, budget.u_max, budget.U_max)
+    try:
+        known = budgets(result)
+    except InputError:
+        return (math.nan,) * 3
+    for budget in known:
+        if budget.quantity == "xy" and budget.anywhere:
+            return budget.u_rms, budget.u_max, budget.U_max
+    return (math.nan,) * 3
 
 
 _SUMMARY_FIELDS = (

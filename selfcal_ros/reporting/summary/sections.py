@@ -397,8 +397,10 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
         return text
     k = result.noise.k_xy
     which = "each" if share else "every site"
-    known = (f"{which} known to ±{um(k * figures.max_u_m)} or better (k={k:.3g})"
-             if math.isfinite(figures.max_u_m) else "uncertainty not known")
+    known, between = "uncertainty not known", anywhere_m(result)[2]
+    if math.isfinite(figures.max_u_m):
+        also = f", any place to ±{um(between)}" if math.isfinite(between) else ""
+        known = f"{which} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"
     where = position_text(result.error_map, figures.max_site)
     return f"{text}: largest error {um(figures.max_error_m)} {where}, {known}"
 

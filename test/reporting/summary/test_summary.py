@@ -30,6 +30,7 @@ from selfcal_ros.model.verdict import (
 )
 from selfcal_ros.reporting.summary.numbers import (
     aligned,
+    anywhere_m,
     arcsec,
     can_print_symbols,
     fixed_column,
@@ -130,6 +131,7 @@ def test_state_sentence_says_what_was_found():
     sentence = state_sentence(result)
     assert sentence.startswith("Calibrated from 4 views: largest error 0.")
     assert "every site known to ±0.0" in sentence and sentence.endswith("arcsec.")
+    assert f"any place to ±{um(anywhere_m(result)[2])}" in sentence
     assert state_sentence(replace(result, warnings=("a", "b"))).endswith("; 2 warnings.")
 
 
