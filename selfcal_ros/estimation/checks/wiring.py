@@ -30,8 +30,9 @@ from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion, V
 BEYOND_DOUBT = 1e-6
 """Probability, over all tests, below which a finding is beyond doubt, as that of a wrong wiring:
 not by chance in a million sessions."""
-TOLD = 1e-3
-"""Probability below which a single offset is taken to follow a single axis wrongly."""
+F_LEVEL = 1e-3
+"""Level of a test of all readings together, or of all offsets of an axis: one good session in a
+thousand fails it."""
 SHOWN = 0.01
 """Probability without motion below which the sign of the offsets counts as confirmed."""
 DOUBLED, HALVED = 1.5, 0.7
@@ -42,7 +43,7 @@ BEYOND = 3.0
 LEAST_SLOPE = 0.3
 """Scale below which an offset is taken not to follow the stage."""
 LEAST_MOTION = 1e-12
-"""Standard deviation of the position, m or rad, attributed to rounding."""
+"""Standard deviation of a position or a misclosure, m or rad, attributed to rounding."""
 AXES = {"grid": ("x", "y"), "angular": ("theta",)}
 
 
@@ -163,7 +164,7 @@ def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResp
     each = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
     axis, p = int(np.argmin(each)), min(*each, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
     return replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p) if (
-        6 * p < TOLD) else None
+        6 * p < F_LEVEL) else None
 
 
 def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
@@ -211,7 +212,7 @@ def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
         if not (moved[i] and moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
             continue
         response = _response(motion, (i, j), axes)
-        if response.p >= TOLD or response.most < LEAST_SLOPE:
+        if response.p >= F_LEVEL or response.most < LEAST_SLOPE:
             continue
         if response.crossed or wiring[j, i] < 0 or _p_of_scale(motion, [(i, j)], limits) < level:
             out.append(response)
@@ -234,7 +235,7 @@ def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
         return right
     best = max(sure, key=likely)
     straight = [wiring for wiring in others
-                if wiring[0, 0] and _p_for(motion, best, wiring) > TOLD]
+                if wiring[0, 0] and _p_for(motion, best, wiring) > F_LEVEL]
     return max(straight, key=likely, default=best)
 
 

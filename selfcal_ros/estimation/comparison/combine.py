@@ -28,10 +28,12 @@ from selfcal_ros.estimation.comparison.maps import (
     variances_of,
     without,
 )
+from selfcal_ros.estimation.datum.covariance import NO_NOISE_M, USUAL_LEVEL
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solve import KEY, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.verdict.uncertainty import (
     INTERPOLATION,
     TOLD,
@@ -63,7 +65,6 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 
-NO_SPREAD = 1e-30
 FEWEST = 7
 """Values that are needed to be sure of a sign."""
 SURE = 5.0
@@ -113,7 +114,7 @@ def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray]
                     raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
                                      f"{parts[first].name}: is it in µ{KINDS[kind]}?",
                                      "give m and rad")
-                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_SPREAD) for n in (index, first))):
+                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE_M) for n in (index, first))):
                     raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
                                      "negative agrees, and it does not",
                                      "give G = indicated - true")
@@ -180,10 +181,6 @@ def exposures(results: Sequence[CalibrationResult | None]) -> dict[str, str]:
     return {"first_exposure": min(times[0]), "last_exposure": max(times[1])}
 
 
-INDEPENDENT = 1e-6
-"""Part of a unit shape outside the span of earlier ones, below which it adds nothing."""
-RUNS_LEVEL = 0.05
-"""Probability that a run stands out, or a part between runs seems to exist, by chance."""
 SINGLE = 0.8
 """Part of the scatter between runs above which a single shape is nearly all of it."""
 TINY = np.finfo(float).tiny
@@ -286,7 +283,7 @@ def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray,
         for _ in range(2):  # the second time removes rounding
             for basis in (q, *(column[:, None] for column in found)):
                 rest = rest - basis @ (basis.T @ rest)
-        if np.linalg.norm(rest) > INDEPENDENT:
+        if np.linalg.norm(rest) > TRACE:
             found.append(rest / np.linalg.norm(rest))
     return q, np.stack(found, axis=1) if found else np.zeros((len(removed), 0))
 
@@ -413,7 +410,7 @@ def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
     shared_part = (weights @ shares) ** 2 * variances(common)
     p = _p_between(families, runs, own)
     of_one = max(families[:shapes.shape[1]], key=lambda family: family.between, default=None)
-    if p < RUNS_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
+    if p < USUAL_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
         dof = _dof_of_single(of_one, weights, shared_part)
     else:
         dof = _dof(runs, own, families, weights, whole=within + shared_part + between)
@@ -751,7 +748,7 @@ def _extra(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
                "sha256": part.result.input.get("sha256", "") if part.result else "",
                "weight": float(means["xy"].weights[index])}
         for kind, mean in means.items():
-            run |= _of_run(mean.deviations[index], SUFFIX[kind], RUNS_LEVEL / len(parts))
+            run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(parts))
         facts["runs"].append(run)
     own = all(part.result is not None for part in parts)
     covers = {kind: mean.covariance for kind, mean in means.items()
@@ -775,7 +772,7 @@ def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
     enlarged: dict[str, Enlargement] = {}
     failed = []
     for kind, mean in means.items():
-        if mean.p_between < RUNS_LEVEL:
+        if mean.p_between < USUAL_LEVEL:
             u, name, unit = np.sqrt(mean.between), BETWEEN + SUFFIX[kind], KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
             failed.append(Finding("between_runs", mean.u_between, unit=unit, p=mean.p_between,

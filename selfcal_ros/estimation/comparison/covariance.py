@@ -40,6 +40,7 @@ from selfcal_ros.estimation.joint.solve import (
 )
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
+from selfcal_ros.estimation.normal.angular import MAX_LINES
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
@@ -47,8 +48,6 @@ from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations
 
-MAX_LINES = 1024
-"""Largest number of lines for a full covariance matrix."""
 MAX_STORED = 2 * 21 * 21
 """Largest number of coordinates whose covariance is stored: 3.5 MB."""
 COVARIANCE = "map_covariance"

@@ -14,7 +14,9 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
     plate_as_map,
 )
+from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, datum_columns, rms
 from selfcal_ros.model.recheck import Significance
@@ -24,14 +26,8 @@ from selfcal_ros.units import MM_PER_M
 KINDS = {"xy": "m", "theta": "rad"}
 """The maps of a result, and their units."""
 
-DIFFERENCE_LEVEL = 0.05
-"""Probability that maps of the same stage differ significantly, both tests together."""
-
 DRAWS = 2000
 """Draws of noise: fifty of them exceed the limit of the largest |z|."""
-
-NO_VARIANCE = 1e-9
-"""Relative variance of a value or combination that the datum removes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +74,18 @@ class Spread:
     @property
     def varies(self) -> np.ndarray:
         """Values that the columns leave a variance, bool (n,)."""
-        return self.variance > NO_VARIANCE * self.variance.max()
+        return self.variance > GAP * self.variance.max()
 
     @cached_property
     def u(self) -> np.ndarray:
         """Standard uncertainty of each value, (n,)."""
-        return np.sqrt(np.maximum(self.variance, NO_VARIANCE * self.variance.max()))
+        return np.sqrt(np.maximum(self.variance, GAP * self.variance.max()))
 
     @cached_property
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (r,) and axes (n, r) of the values over `u`."""
         values, vectors = np.linalg.eigh(self.remaining / np.outer(self.u, self.u))
-        determined = values > NO_VARIANCE * values[-1]
+        determined = values > GAP * values[-1]
         return np.sqrt(values[determined]), vectors[:, determined]
 
     @property
@@ -154,7 +150,7 @@ def significance(values: np.ndarray, spread: Spread) -> Significance | None:
     p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
     of_largest = spread.variance[np.abs(values).argmax()]
     return Significance(square / rank, float(rank), p, spread.correlated, largest, limit, p_z, dof,
-                        min(p, p_z) < DIFFERENCE_LEVEL / 2,
+                        min(p, p_z) < USUAL_LEVEL / 2,
                         u_rms=float(np.sqrt(spread.variance.mean())),
                         u_largest=float(np.sqrt(of_largest)))
 
@@ -169,23 +165,19 @@ def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def _of_largest(largest: float, n: int, drawn: np.ndarray | None,
                 noise_dof: float) -> tuple[float, float]:
-    """Return the probability of such a |z| among n values, and the limit of DIFFERENCE_LEVEL / 2.
+    """Return the probability of such a |z| among n values, and the limit of USUAL_LEVEL / 2.
 
     The number of values bounds it (Bonferroni); the largest |z| of draws, if there are any, give it
     for correlated nodes, except in the far tail, where the bound is close.
     """
     dof = min(noise_dof, MANY_DOF)
     bound = min(float(2 * n * stdtr(dof, -largest)), 1.0)
-    limit = -float(stdtrit(dof, DIFFERENCE_LEVEL / 4 / n))
+    limit = -float(stdtrit(dof, USUAL_LEVEL / 4 / n))
     if drawn is None:
         return bound, limit
-    above = int(DIFFERENCE_LEVEL / 2 * (len(drawn) + 1))
+    above = int(USUAL_LEVEL / 2 * (len(drawn) + 1))
     p = (1 + np.count_nonzero(drawn >= largest)) / (1 + len(drawn))
     return min(bound, float(p)), min(limit, float(np.sort(drawn)[-above]))
-
-
-PITCH_TOLERANCE = 1e-9
-"""Largest relative difference of pitch between two maps of the same lattice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +321,7 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
     if a.marks != b.marks:
         raise InputError(f"{names[0]} and {names[1]}", "the lists of marks differ",
                          "compare maps of the same plate")
-    if abs(a.grid_pitch_m - b.grid_pitch_m) > PITCH_TOLERANCE * a.grid_pitch_m:
+    if abs(a.grid_pitch_m - b.grid_pitch_m) > GAP * a.grid_pitch_m:
         raise InputError(f"{names[0]} and {names[1]}", "the lattices differ: pitches of "
                          f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",
                          "compare maps of the same plate")

@@ -28,15 +28,13 @@ from selfcal_ros.estimation.comparison.maps import (
     without,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.model.error_map import ErrorMap, datum_columns, rms
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 
 AXES = {"xy": ("x", "y"), "theta": ("theta",)}
 """Axes of each map."""
-
-REMAINS_LEVEL = 0.0005
-"""Probability of a test below which an error remains: a verdict on wiring, not on drift."""
 
 EXPLAINED = 0.1
 """Part of the square of the larger of map and correction that a fault leaves unexplained."""
@@ -318,7 +316,7 @@ def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult],
 
 def _is_clear(test: Significance | None) -> bool:
     """Return whether an error remains beyond the uncertainties."""
-    return test is not None and min(test.p, test.p_z) < REMAINS_LEVEL
+    return test is not None and min(test.p, test.p_z) < CAUSE_LEVEL
 
 
 def _square(values: np.ndarray) -> float:

@@ -28,6 +28,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.checks.wiring import LEAST_MOTION
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import (
@@ -388,11 +389,9 @@ class MapsCovariance:
             terms.turned, terms.covariance))
 
 
-MISCLOSURE_LEVEL = 0.05
-"""Level of the test of the three redundant axis conditions, which this datum claims to hold."""
-
-CLOSED_RAD = 1e-12
-"""Misclosure attributed to rounding, rad."""
+USUAL_LEVEL = 0.05
+"""Level of a test of two statements against each other, of maps, runs, or axes and their datum:
+as often as that an interval of k = 2 misses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -532,7 +531,7 @@ def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[flo
         return 1.0, 0.0
     contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
     contrast = contrasts @ misclosure
-    spread = contrasts @ covariance @ contrasts.T + CLOSED_RAD**2 * np.eye(n - 1)
+    spread = contrasts @ covariance @ contrasts.T + LEAST_MOTION**2 * np.eye(n - 1)
     value = float(contrast @ np.linalg.solve(spread, contrast))
     return float(chdtrc(n - 1, value)), float(np.abs(contrast).max())
 

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
-from selfcal_ros.estimation.joint.problem import F_LEVEL
+from selfcal_ros.estimation.joint.problem import F_LEVEL, MAX_STEPS
+from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
@@ -27,9 +28,6 @@ POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
 cubic ones look like linear ones in three cells."""
 
-UNREAD = 1e-6
-"""Size below which a column, or its part in a combination, counts as zero."""
-
 MOST_U = 5.0
 """Largest uncertainty of the offset in a cell of a view, over their median; others are too few."""
 
@@ -41,9 +39,6 @@ IN_LINE = 3e-3
 
 STEP_M = 1e-6
 """Half the distance over which the slope of the distortion is taken, small in any camera."""
-
-STEPS = 20
-"""Most steps from a published offset to the true one: each is shorter by the slope of the error."""
 
 Powers = Sequence[tuple[int, int]]
 
@@ -66,7 +61,7 @@ class Distortion:
     def at(self, offset: np.ndarray) -> np.ndarray:
         """Return the error at published offsets, complex, m: that at the true ones."""
         error = np.zeros_like(offset)
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             before, error = error, _terms(offset - error, self.powers) @ self.coefficients
             if np.array_equal(error, before):
                 break
@@ -166,9 +161,12 @@ def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
     if not _determined(published, POWERS[1]):
         return None
     error = found
-    for _ in range(STEPS):  # from the optical axis on, not from the offsets in its cell
+    for _ in range(MAX_STEPS):  # from the optical axis on, not from the offsets in its cell
+        before = error
         powers, fit = _polynomial(published - error, found, samples)
         error = found - (fit @ found)[0]
+        if np.array_equal(error, before):
+            break
     moved = samples @ fit.T
     return Camera(powers, fit @ error, image, cells, published - error, error, _spread(
         samples - moved[:, :1]), _spread(moved), noises.image, noises.mark)
@@ -351,9 +349,9 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     name = next(term.name for term in model.problem.terms if term.block.of_images)
     free = replace(model.equations,
                    columns=model.equations.columns.scaled(name, math.inf))
-    rows = free.rows([name]) & (free.norm > free.norm.max() * UNREAD)
+    rows = free.rows([name]) & (free.norm > free.norm.max() * TRACE)
     seen = rows[free.rows([name])]
-    if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=UNREAD) > 1:
+    if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=TRACE) > 1:
         return None
     noise, taken = model.found.xy, model.coefficients
     now = score(free, model.found.both_residuals, squares(model.problem, model.found),

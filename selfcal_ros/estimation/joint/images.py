@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.normal.equations import Memo, NormalEquations
-from selfcal_ros.estimation.terms.equations import UNTOLD
 from selfcal_ros.estimation.terms.visits import StageYaw
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import CellsSeen, View, cells_seen
@@ -225,7 +225,7 @@ def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
     gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
     norm = np.abs(flat).max()
     values, vectors = np.linalg.eigh(gram)
-    determined = values > UNTOLD * norm**2 * len(flat.T)
+    determined = values > GAP * norm**2 * len(flat.T)
     inverse = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
     return FittedYaw(grid.weight, residuals, parameters, inverse, int(determined.sum()))
 

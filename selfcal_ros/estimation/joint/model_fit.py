@@ -25,6 +25,7 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
     FLOOR,
+    MAX_FULL,
     MAX_STEPS,
     NEGLIGIBLE,
     ROUNDING,
@@ -41,7 +42,7 @@ from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
-    NO_VARIANCE,
+    ROUNDED,
     ReducedColumns,
     SizeTest,
     TermEquations,
@@ -289,7 +290,7 @@ class _State:
             return False
         of_view = sigma / np.sqrt(weight.reshape(len(weight), -1).sum(axis=1).max())
         spread = np.diag(self.found.inverse)
-        told = spread > NO_VARIANCE * spread.max(initial=0.0)
+        told = spread > ROUNDED * spread.max(initial=0.0)
         noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
         still = bool((self.moved_m <= part * noise).all()) or self.changed_m <= part * of_view
         return still and self.moving.change <= part * of_view
@@ -397,10 +398,6 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations,
             angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()))
 
 
-MAX_COEFFICIENTS = 31 * 31
-"""Largest refined spline that is fitted: a few seconds of one processor."""
-
-
 class FinerEquations(PlacedEquations):
     """Equations of a refined map, of which the readings may determine only a part."""
 
@@ -430,7 +427,7 @@ def is_too_large(problem: Problem) -> bool:
     """Return whether a map has too many nodes for a finer one."""
     system = problem.system
     return isinstance(system, PlacedEquations) and (
-        math.prod(system.grid.views.spline.refined.shape) > MAX_COEFFICIENTS)
+        math.prod(system.grid.views.spline.refined.shape) > MAX_FULL)
 
 
 def equations_left(grid: PlacedSystem) -> int:

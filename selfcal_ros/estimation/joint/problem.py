@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import fdtrc, stdtrit
 
+from selfcal_ros.estimation.checks.wiring import F_LEVEL
 from selfcal_ros.estimation.datum.covariance import Conditions, scale_of, scale_of_plate
 from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
@@ -33,9 +34,6 @@ DECLARED_DOF = 8.0
 
 MIN_REPEAT_DOF = 30
 """Degrees of freedom from which the scatter of repeats is used; below, the residuals."""
-
-F_LEVEL = 1e-3
-"""Level of a test of all readings together: one good session in a thousand fails it."""
 
 NEGLIGIBLE = 1e-3
 """Part of an uncertainty, or of what makes it, that changes no stated figure."""
@@ -572,6 +570,9 @@ FAR = 0.02
 
 SAMPLES = 1000
 """Fewest sites of all draws of noise together: enough for a ratio of sums of squares."""
+
+MAX_FULL = 31 * 31
+"""Largest field with a full matrix over its sites, or over the coefficients of a finer map."""
 
 MAX_STEPS = 100
 """Most steps of an iteration, of which good readings need a few."""

@@ -40,6 +40,7 @@ from selfcal_ros.estimation.joint.noise_effects import (
     structured,
 )
 from selfcal_ros.estimation.joint.problem import (
+    MAX_FULL,
     NEGLIGIBLE,
     NoiseEstimate,
     Problem,
@@ -202,9 +203,6 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
 
 KEY = "covariance_terms"
 """Key of the factors in a result."""
-
-MAX_FULL = 31 * 31
-"""Largest field with a full matrix over its sites: covariance, leverages of the readings."""
 
 BESIDE = "beside"
 """Key of what each factor makes of other quantities: `plate` (r, 2, nx, ny), as those of the map;

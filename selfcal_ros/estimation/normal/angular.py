@@ -20,8 +20,8 @@ from scipy.sparse.linalg import splu
 from selfcal_ros.compensation.circle import fourier_basis, fourier_coefficients
 from selfcal_ros.estimation.lattice.connectivity import Components, components, rest_on_one
 
-DENSE_LINES = 512
-"""Largest K solved with dense matrices."""
+MAX_LINES = 1024
+"""Largest number of lines with dense matrices over them: 8 MB each."""
 
 
 class AngularSystem:
@@ -131,14 +131,14 @@ class AngularSystem:
 
     @cached_property
     def _factor(self) -> Any:
-        if self.n_lines <= DENSE_LINES:
+        if self.n_lines <= MAX_LINES:
             return lapack.dpotrf(self.matrix.toarray(), lower=1)[0]
         return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                     options={"SymmetricMode": True})
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution of the pinned system for (K,) or (K, k)."""
-        if self.n_lines <= DENSE_LINES:
+        if self.n_lines <= MAX_LINES:
             return lapack.dpotrs(self._factor, right, lower=1)[0].reshape(right.shape)
         return self._factor.solve(right)
 
@@ -180,8 +180,8 @@ KNOWN = 3.0
 (rms over the circle) of a harmonic: what is known no worse is corrected rather than left."""
 
 GAP = 1e-9
-"""Relative size below which an eigenvalue of a matrix of misalignments, or of coefficients of a
-series, is zero: true zeros are near 1e-15 and the smallest others above 1e-4."""
+"""Relative size below which a number counts as zero: true zeros (of eigenvalues, of variances that
+the datum removes, of differences of pitches) are near 1e-15, the smallest others above 1e-4."""
 
 
 class HarmonicSystem(AngularSystem):

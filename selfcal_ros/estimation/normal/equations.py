@@ -38,11 +38,12 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
-UNMOVED = 1e-6
-"""Change of a value by a misalignment of unit length up to which it is rounding, of 1e-9."""
+TRACE = 1e-6
+"""Part of a whole, or of a misalignment of unit length, that counts as none: rounding is 1e-9."""
 
-CORE_SITES = 41
-"""Sites per side of the middle part of a large field."""
+FULL_SIZE = 41
+"""Sites per side of the largest field in which everything is tried, causes and candidates, in a
+second; of a larger one its middle, or a smaller field of its shape, stands for it."""
 
 
 class NormalEquations:
@@ -77,7 +78,7 @@ class NormalEquations:
         If the middle of the plate determines all misalignments up to the datum, so does the
         whole, since more readings can only add; if not, the whole has to be factorised.
         """
-        if self.grid.n_sites <= CORE_SITES**2 or not self.rank_only:
+        if self.grid.n_sites <= FULL_SIZE**2 or not self.rank_only:
             return self.grid
         core = core_of(self.grid)
         values = np.linalg.eigvalsh(core.schur)
@@ -201,7 +202,7 @@ class NormalEquations:
             return np.zeros((self.size, 0))
         residual = self._null - rigid @ (rigid.T @ self._null)
         u, s, _ = np.linalg.svd(residual, full_matrices=False)
-        return u[:, s > UNMOVED]
+        return u[:, s > TRACE]
 
     @property
     def hides_fields(self) -> bool:
@@ -230,13 +231,13 @@ class NormalEquations:
         hidden = self.unseen[:3 * self.grid.n_views]
         parts = self.grid.components
         known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
-        if np.any(np.abs(hidden) > UNMOVED) and known.any():
+        if np.any(np.abs(hidden) > TRACE) and known.any():
             moved = self.grid.response @ hidden
             gauge = Gauge(self.grid.views.z_sites, known.reshape(self.grid.views.shape), scale=True)
             for column in moved.T:
                 field = column.reshape(self.grid.views.shape)
                 residual = gauge.remove(field, gauge.parts(field)).ravel()
-                known &= abs(residual) <= UNMOVED
+                known &= abs(residual) <= TRACE
         return known.reshape(self.grid.views.shape)
 
     @property
@@ -270,7 +271,7 @@ class NormalEquations:
             moved = column - parts @ self.rigid[:4]
             plate, _ = self.grid.plate(nothing, self.gauge.remove(field, parts), moved[:n])
             moved = moved - self.plate_gauge.parts(plate) @ self.rigid[4:]
-            known &= abs(moved) <= UNMOVED
+            known &= abs(moved) <= TRACE
         return known & (self._turn_of_lines == 0) if self.apart else known
 
     @cached_property
@@ -290,7 +291,7 @@ class NormalEquations:
         if self.unseen.shape[1] and known.any():
             moved = self.angular.response @ self.unseen[self.phi_at]
             moved = moved - moved[known].mean(axis=0)
-            known = known & np.all(abs(moved) <= UNMOVED, axis=1)
+            known = known & np.all(abs(moved) <= TRACE, axis=1)
         return known
 
     @cached_property
@@ -311,7 +312,7 @@ class NormalEquations:
 
 def core_of(grid: GridSystem) -> GridSystem:
     """Return the smaller system of the marks and sites in the middle of a field."""
-    low = [(size - CORE_SITES) // 2 if size > CORE_SITES else 0 for size in grid.views.shape]
+    low = [(size - FULL_SIZE) // 2 if size > FULL_SIZE else 0 for size in grid.views.shape]
     part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
     weight = grid.weight[(slice(None), *part)]
     inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
@@ -543,7 +544,7 @@ class PlacedEquations(NormalEquations):
         views = self.grid.views
         gauge = Gauge(views.z_sites, np.ones(views.shape, dtype=bool), scale=True)
         fields = (self.grid.response @ self.unseen[:3 * self.grid.n_views]).T
-        return any(np.abs(gauge.remove(field, gauge.parts(field))).max() > UNMOVED
+        return any(np.abs(gauge.remove(field, gauge.parts(field))).max() > TRACE
                    for field in fields.reshape(-1, *views.shape))
 
     @cached_property

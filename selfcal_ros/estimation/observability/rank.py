@@ -20,7 +20,7 @@ from itertools import product
 import numpy as np
 
 from selfcal_ros.estimation.lattice.maps import PHASES
-from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
+from selfcal_ros.estimation.normal.angular import GAP, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import (
     Memo,
     NormalEquations,
@@ -251,10 +251,6 @@ def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
     return int(turns_deg[(1 / np.maximum(information, 1e-12)).sum(axis=1).argmin()])
 
 
-MATCH = 1e-9
-"""Largest relative residual sum of squares of an unseen field."""
-
-
 def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     """Return whether a stage error can be compensated by a plate error and misalignments.
 
@@ -280,7 +276,7 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
         block[np.ix_(system.phi_at, system.phi_at)] += weight * system.angular.schur
         block = grid.tied(block)
     explained = right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
-    return bool(total - explained <= MATCH * scale)
+    return bool(total - explained <= GAP * scale)
 
 
 def unseen_modes(system: NormalEquations) -> Iterator[Finding]:

@@ -24,7 +24,7 @@ from scipy.special import fdtri
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import planned_system
+from selfcal_ros.estimation.normal.equations import TRACE, planned_system
 from selfcal_ros.estimation.observability.plan_check import (
     SEARCH_SIZE,
     Prediction,
@@ -279,9 +279,6 @@ QUANTITIES = ("xy", "theta")
 MATTERS = 0.05
 """Share of u^2 from which a change of the plan that removes a line is sought."""
 
-NEGLIGIBLE = 1e-6
-"""Share of the noise below which a term has no line."""
-
 REMOVED = 0.7
 """Part of a line that may be left by what removes it."""
 
@@ -376,7 +373,7 @@ def _budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, alone: Pre
         lines.append(_line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings"))
         for term in terms:
             effect = effects[term.name][at][known] if term.name in effects else np.zeros(1)
-            if effect.mean() > NEGLIGIBLE * noise.mean():
+            if effect.mean() > TRACE * noise.mean():
                 source = "declared" if term.name in asked else "default"
                 lines.append(_line(quantity, str(term.name), effect, u=term.size,
                                    unit=term.block.unit, source=source))

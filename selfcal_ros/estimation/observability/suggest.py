@@ -14,7 +14,7 @@ from math import comb, inf
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import planned_system
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, planned_system
 from selfcal_ros.estimation.observability.plan_check import (
     SEARCH_SIZE,
     Prediction,
@@ -47,9 +47,6 @@ STEPS = ((30, 1.0), (15, 0.5), (5, 0.2), (1, 0.1))
 
 REACH = 0.2
 """Largest shift along an axis, as a part of the plate: beyond it too few marks are in the field."""
-
-REFINED = 5
-"""Starts that are refined: there are several minima."""
 
 Pose = tuple[int, float, float]
 """Turn in degrees, shift along x and y in pitches."""
@@ -101,7 +98,7 @@ def best_pose(starts: Sequence[Pose], reach: float,
         return known[pose]
 
     found = []
-    for best in sorted(starts, key=key)[:REFINED]:
+    for best in sorted(starts, key=key)[:FINALISTS]:
         for turn, shift in STEPS:
             while key(near := min(_neighbours(best, turn, shift, reach), key=key)) < key(best):
                 best = near
@@ -121,9 +118,6 @@ def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[P
                     if abs(to) <= reach)
 
 
-FULL_SIZE = 41
-"""Largest field on which every candidate is evaluated in full."""
-
 EXHAUSTIVE = 2000
 """Largest number of plans for which all are tried; above, greedy choice and exchange."""
 
@@ -134,7 +128,8 @@ MAX_TIES = 64
 """Largest number of plans that differ only in their lines to be evaluated with them."""
 
 FINALISTS = 5
-"""Plans from a search on a smaller field that are evaluated on the plan's own field."""
+"""Starts of a search that are refined, and plans of one on a smaller field that are evaluated on
+the plan's own: there are several minima."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
 from selfcal_ros.estimation.joint.solve import MAX_FULL, fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import Memo, NormalEquations, grid_residuals
+from selfcal_ros.estimation.normal.equations import TRACE, Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (
     SLIP,
@@ -368,9 +368,6 @@ increases the residuals of its neighbours."""
 MAX_REMOVED = 0.1
 """Largest share of the readings that is removed; if it is more, the fault is another one."""
 
-TIED = 1e-6
-"""Relative difference of ratios up to which both readings are removed."""
-
 NAMED = 5
 """Number of outliers listed in their finding; ``extra["outliers"]`` has all."""
 
@@ -539,7 +536,7 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             grid = readings.kind == "grid"
             nodes = (("mark", at[1:]), ("site", int(sites[at]))) if grid else ("lines",)
             above = max((taken[node] for node in nodes if node in taken), default=0.0)
-            if above > (1 + TIED) * ratio[at]:
+            if above > (1 + TRACE) * ratio[at]:
                 continue
             taken |= {node: float(ratio[at]) for node in nodes if node not in taken}
             index = of_views.index[at[0]]
@@ -561,7 +558,7 @@ def _restored(measurements: Measurements, options: Options, gone: dict[Key, Remo
         if key not in gone:
             continue
         mates = {k for k in gone if k[1] == key[1] and abs(
-            gone[k].standardised - gone[key].standardised) <= TIED * gone[key].standardised}
+            gone[k].standardised - gone[key].standardised) <= TRACE * gone[key].standardised}
         for back in dict.fromkeys((frozenset([key]), frozenset(mates))):
             rest = {k: v for k, v in gone.items() if k not in back}
             again = residuals_of(without(measurements, rest), options)

@@ -34,14 +34,13 @@ from selfcal_ros.estimation.lattice.readings import (
     pose_of,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import Marks, lines_of
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, Marks, lines_of
 from selfcal_ros.estimation.observability.plan_check import (
     SEARCH_SIZE,
     candidate_views,
     smaller,
 )
 from selfcal_ros.estimation.observability.rank import identifies
-from selfcal_ros.estimation.observability.suggest import FULL_SIZE
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_columns
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, reduce_columns

@@ -18,14 +18,13 @@ from scipy.special import chdtrc, fdtrc, i0e, stdtr
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
-    DIFFERENCE_LEVEL,
     DRAWS,
-    NO_VARIANCE,
-    PITCH_TOLERANCE,
+    USUAL_LEVEL,
     Spread,
     joint_dof,
     significance,
 )
+from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
 from selfcal_ros.estimation.recheck.views import NewMap
 from selfcal_ros.model.artifact import Artifact
@@ -74,7 +73,7 @@ class ChangeTests(Spread):
                             for j in range(ORDER + 1 - i)], axis=1)
         basis, size, _ = np.linalg.svd(self.without(np.kron(np.eye(2), columns)),
                                        full_matrices=False)
-        return basis[:, size > np.sqrt(NO_VARIANCE) * size[0]]
+        return basis[:, size > np.sqrt(GAP) * size[0]]
 
     @cached_property
     def _whiten_smooth(self) -> np.ndarray:
@@ -294,7 +293,7 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     """
     known, old = plate.together.sites.ravel(), plate.result.artifact
     if artifact.shape == old.shape and abs(
-            artifact.grid_pitch_m / old.grid_pitch_m - 1) < PITCH_TOLERANCE:
+            artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
         return np.eye(len(known))[:, known], known
     return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
@@ -311,15 +310,15 @@ def recheck_found(change: Change, lines: Change, artifact: Artifact, plate: Know
                             float(change.values[change.worst]), float(change.u[change.worst]))
     tested = [part.p for part in (change, lines) if part.test is not None]
     p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
-    scale = ScaleChange(change.p_scale < DIFFERENCE_LEVEL, change.scale, change.u_scale,
+    scale = ScaleChange(change.p_scale < USUAL_LEVEL, change.scale, change.u_scale,
                         change.p_scale)
     (dx, dy), (u_dx, u_dy) = change.values, change.u
     found = Recheck(
-        plate.where, _calibration(plate.result), p < DIFFERENCE_LEVEL, p, largest,
+        plate.where, _calibration(plate.result), p < USUAL_LEVEL, p, largest,
         rms(change.values), rms(change.u), p_xy=change.p, significance_xy=change.test, scale=scale,
         dx=dx, dy=dy, u_dx=u_dx, u_dy=u_dy, passes=passes)
     if change.tests is not None:
-        found = replace(found, detectable=change.tests.detectable(DIFFERENCE_LEVEL / len(tested)))
+        found = replace(found, detectable=change.tests.detectable(USUAL_LEVEL / len(tested)))
     if lines.test is None:
         return found
     line, = lines.worst

@@ -25,10 +25,11 @@ from selfcal_ros.estimation.checks.placing import (
     on_marks,
     said,
 )
+from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import Together, together
-from selfcal_ros.estimation.comparison.maps import PITCH_TOLERANCE
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.maps import MapSpline
+from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
@@ -196,7 +197,7 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     mine, other = measurements.artifact, plate.result.plate
     if (mine.shape, mine.angular_count, mine.marks) != (
             other.shape, other.angular_count, other.marks) or abs(
-            mine.grid_pitch_m / other.grid_pitch_m - 1) > PITCH_TOLERANCE:
+            mine.grid_pitch_m / other.grid_pitch_m - 1) > GAP:
         raise InputError(plate.where, f"its plate has {_described(other)}, not {_described(mine)}",
                          "name the calibration of that plate")
     if mine.map_grid is None and other.map_grid is not None:
@@ -253,9 +254,6 @@ NEIGHBOURS = 1.3
 
 DISTANCES = ((0.7, 1.2), (1.2, 1.7), (1.7, 2.2))
 """Distances at which differences are compared, in pitches."""
-
-FAR = 3.0
-"""Length of a difference, in standard deviations, beyond which it is of a single mark."""
 
 PLANNED = (1 + 0j, 0j)
 """No further turn, no further shift."""
@@ -408,7 +406,7 @@ def _not_shared(marks: np.ndarray, rest: np.ndarray) -> float:
     Half the mean squares of differences at 1, 1.4 and 2 pitches, continued to no distance by a
     parabola in its square. Single marks that are far off count as far off as others.
     """
-    size = np.maximum(np.abs(rest) / (FAR * _size(rest)), 1.0)
+    size = np.maximum(np.abs(rest) / (BEYOND * _size(rest)), 1.0)
     away, rest, means = np.abs(marks[:, None] - marks), rest / size, []
     for nearest, farthest in DISTANCES:
         first, other = np.nonzero((away > nearest) & (away < farthest))

@@ -29,7 +29,7 @@ from selfcal_ros.estimation.joint.solve import noise_of, views_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import system_for
+from selfcal_ros.estimation.normal.equations import TRACE, system_for
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
@@ -67,9 +67,6 @@ from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
 
 MOST_OF_IMAGES = 3200
 """Largest number of readings of images: their covariance is dense, 8 bytes (2 n)^2."""
-
-LEAST_PART = 1e-6
-"""Least part of the variance of a reading that is a mark's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +299,7 @@ def _noise_of_marks(readings: PlateReadings, plate: KnownPlate, sigma: float,
     of_mark = sigma**2
     if len(readings.stop):
         of_mark = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
-        of_mark = float(np.clip(of_mark, LEAST_PART * sigma**2, sigma**2))
+        of_mark = float(np.clip(of_mark, TRACE * sigma**2, sigma**2))
     return ReadingNoise(np.tile(of_mark / readings.weight, 2), {
         NOISE: np.sqrt(sigma**2 - of_mark) * readings.of_images(), TERMS: terms})
 

@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 
 from selfcal_ros.blocks import Block
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
-from selfcal_ros.estimation.joint.problem import Moving, Problem
+from selfcal_ros.estimation.joint.problem import FLOOR, MAX_STEPS, Moving, Problem
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import rotation_excess
@@ -32,14 +32,8 @@ from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import Observability
 
-MOST_STEPS = 50
-"""Most steps to the places of the stage and the rotations of the plate."""
-
 MOST_DATUMS = 12
 """Most datums from that of the core to that of the known nodes."""
-
-STILL = 1e-13
-"""Change of a reading, m, that counts as zero."""
 
 NOISE, TERMS = "reading noise", "terms"
 PLATE, TEMPERATURE = "known plate", "plate temperature"
@@ -393,7 +387,7 @@ def _settled(readings: PlateReadings, rows: np.ndarray, design: np.ndarray, *, k
     problem, at, n = readings.problem, readings.at, known.size
     marks = problem.system.grid.views.z[at[1:]] * problem.half_width_m
     moving, nonlinear = Moving(problem), np.zeros(len(y), dtype=complex)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         right, before = stacked(y - nonlinear), nonlinear
         unknowns = rows @ right
         field = (unknowns[:n] + 1j * unknowns[n:2 * n]).reshape(known.shape)
@@ -402,7 +396,7 @@ def _settled(readings: PlateReadings, rows: np.ndarray, design: np.ndarray, *, k
         if problem.rigid:
             phi = unknowns[2 * n::3][at[0]] / problem.half_width_m
             nonlinear = nonlinear + rotation_excess(phi, marks, plate)
-        if np.abs(nonlinear - before).max() <= STILL:
+        if np.abs(nonlinear - before).max() <= FLOOR:
             return unknowns, right - design @ unknowns
     raise NotSettledError("recheck", "the rotations of the plate do not converge",
                           "check the readings for misalignments of more than a few degrees")

@@ -25,7 +25,7 @@ from scipy.special import chdtri, fdtrc
 
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.angular import GAP, AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
 from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
@@ -225,11 +225,9 @@ def _lines_eliminated(angular: AngularSystem,
     return free, weighted.sum(axis=1) - angular.columns.T @ free, (gram + gram.T) / 2
 
 
-UNTOLD = 1e-9
-"""Relative size below which an eigenvalue of the scaled equations is zero."""
-
 ROUNDED = 1e-12
-"""The same of one that is rounding alone: exact lines leave others of 1e-9 that are told."""
+"""The same of an eigenvalue or a variance that is rounding alone: exact lines leave others of 1e-9
+that are told."""
 
 LEAST_NOISE_M = 1e-12
 """Smallest noise against which sizes are weighted, m: less is rounding."""
@@ -241,9 +239,6 @@ microscope: below, they would be dominated by their own noise, which is in the r
 MOVES_THE_MAP = 1e-5
 """Relative rms of the map above which a combination of columns that cannot be seen is an
 undetermined mode: rounding gives 1e-9, the smallest true ones 1e-2."""
-
-NO_VARIANCE = 1e-12
-"""Relative size below which a variance is zero."""
 
 FREE = ""
 """Name of the part of a covariance that all free terms have together."""
@@ -335,7 +330,7 @@ class TermEquations:
         seen = self._norm_of_microscope[rows]
         least = float(seen.min()) if len(seen) else np.inf
         # each column contains the noise of one coordinate of every mean
-        return max(UNTOLD, OVER_NOISE * self._power / least**2)
+        return max(GAP, OVER_NOISE * self._power / least**2)
 
     @cached_property
     def _norm_of_microscope(self) -> np.ndarray:
@@ -450,7 +445,7 @@ class TermEquations:
         # sized coefficients may be determined far better than free ones in these units; the
         # diagonal of an undetermined free one is rounding
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
-        own = np.sqrt(np.where(self.free & (diagonal <= UNTOLD), 1.0, diagonal))
+        own = np.sqrt(np.where(self.free & (diagonal <= GAP), 1.0, diagonal))
         null = np.linalg.qr(own[:, None] * hold)[0]
         found = np.linalg.pinv(matrix / np.outer(own, own) + null @ null.T, hermitian=True,
                                rcond=1e-14) - null @ null.T
@@ -620,7 +615,7 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     for name in sized:
         at = columns.rows([name])
         values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
-        determined = values > NO_VARIANCE * max(values[-1], 0.0)
+        determined = values > ROUNDED * max(values[-1], 0.0)
         root = rest[:, at] @ (vectors[:, determined] / np.sqrt(values[determined]))
         rest = rest - root @ root.T
         out.append((str(name), root))

@@ -26,7 +26,7 @@ from selfcal_ros.estimation.checks.wiring import (
     sign_is_shown,
     sign_of_lines_is_shown,
 )
-from selfcal_ros.estimation.datum.covariance import MISCLOSURE_LEVEL
+from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
@@ -88,7 +88,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
             "finite_rotation", max(abs(view.phi) for view in checked.result.views), unit="rad",
             details={"residuals": checked.xy.residuals}))
     p, size_rad = checked.axes
-    if not p >= MISCLOSURE_LEVEL:
+    if not p >= USUAL_LEVEL:
         failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(Finding("not_converged"))

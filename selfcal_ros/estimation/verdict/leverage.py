@@ -14,16 +14,13 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.problem import FLOOR
-from selfcal_ros.estimation.normal.angular import AngularSystem
+from selfcal_ros.estimation.normal.angular import MAX_LINES, AngularSystem
 from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
     grid_residuals,
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
-
-EXACT_LINES = 2048
-"""Largest number of lines whose leverages are computed exactly; otherwise all have their mean."""
 
 N_DRAWS = 64
 """Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
@@ -170,7 +167,7 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
     angular = system.angular
     if not angular.n_views:
         return np.zeros(angular.weight.shape)
-    if angular.n_lines > EXACT_LINES:
+    if angular.n_lines > MAX_LINES:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
     inverse = angular.solve(np.eye(angular.n_lines))

@@ -16,6 +16,7 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.checks.wiring import BEYOND, BEYOND_DOUBT
 from selfcal_ros.estimation.joint.model_fit import finer
 from selfcal_ros.estimation.joint.solve import UNASKED_SITES, Solved, solve_joint
+from selfcal_ros.estimation.normal.equations import FULL_SIZE
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, SizeTest
 from selfcal_ros.estimation.verdict.causes import (
@@ -43,7 +44,7 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, merged
 from selfcal_ros.model.verdict import Cause, Remedy, TermResult
 
-ALWAYS_SITES = 41 * 41
+ALWAYS_SITES = FULL_SIZE**2
 """Field up to which causes are always searched for; in a larger one only if a test fails."""
 
 MATTERS = 0.1

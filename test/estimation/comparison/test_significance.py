@@ -12,7 +12,7 @@ from scipy.stats import t as student_t
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import (
-    DIFFERENCE_LEVEL,
+    USUAL_LEVEL,
     Spread,
     _of_largest,
     compare,
@@ -74,7 +74,7 @@ def test_the_largest_of_independent_values_has_its_own_distribution():
         found = significance(values, Spread(cover, np.zeros((n, 0)), KNOWN))
         assert found.largest_z == pytest.approx(z)
         assert found.p_z == pytest.approx(exact, rel=0.15)
-        p = (1 - (1 - DIFFERENCE_LEVEL / 2) ** (1 / n)) / 2
+        p = (1 - (1 - USUAL_LEVEL / 2) ** (1 / n)) / 2
         assert found.z_limit == pytest.approx(norm.isf(p), rel=0.05)
         assert not found.significant
     values[7] = -6
@@ -87,7 +87,7 @@ def test_values_that_move_together_count_once():
     cover = np.ones((n, n)) + 1e-12 * np.eye(n)
     found = significance(np.full(n, 2.0), Spread(cover, np.zeros((n, 0)), KNOWN))
     assert found.p_z == pytest.approx(2 * norm.sf(2.0), abs=0.015)
-    assert found.z_limit == pytest.approx(norm.isf(DIFFERENCE_LEVEL / 4), rel=0.12)
+    assert found.z_limit == pytest.approx(norm.isf(USUAL_LEVEL / 4), rel=0.12)
 
 
 PLAIN = Options(datum_theta="zero_mean", misalignment_model="linear", causes=False)
@@ -109,7 +109,7 @@ def test_missing_marks_do_not_make_maps_differ():
         assert sum(value < 0.5 for value in p) >= binom.ppf(0.001, len(found), 0.5)
     assert all(item.xy.correlated for item in found)
     significant = sum(bool(item.significant) for item in found)
-    assert significant <= binom.ppf(0.999, len(found), DIFFERENCE_LEVEL)
+    assert significant <= binom.ppf(0.999, len(found), USUAL_LEVEL)
 
 
 def test_one_node_that_moved_is_found():
@@ -122,7 +122,7 @@ def test_one_node_that_moved_is_found():
         moved[at] += 8 * emap.u_gx[at]
         found = compare(a, replace(b, error_map=replace(emap, gx=moved)))
         caught += found.significant
-        if found.xy.p_z < DIFFERENCE_LEVEL / 2:
+        if found.xy.p_z < USUAL_LEVEL / 2:
             z = abs(np.stack([found.dx, found.dy]))
             assert found.xy.largest_z > found.xy.z_limit and z.max() == found.max_m
     assert caught >= 18
@@ -142,11 +142,11 @@ def test_the_comparison_is_the_same_after_the_file():
 def test_nodes_that_move_together_are_as_one(noise_dof):
     """Of ten equal values the largest is Student's or normal itself, not one of ten."""
     alone = student_t(noise_dof) if np.isfinite(noise_dof) else norm
-    limit = alone.isf(DIFFERENCE_LEVEL / 4)
+    limit = alone.isf(USUAL_LEVEL / 4)
     drawn = Spread(np.ones((10, 10)), np.zeros((10, 0)), noise_dof).drawn
     p, found = _of_largest(limit, 10, abs(drawn).max(axis=0), noise_dof)
-    assert p == pytest.approx(DIFFERENCE_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
+    assert p == pytest.approx(USUAL_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
     assert found == pytest.approx(limit, rel=0.06)
     apart, bound = _of_largest(limit, 10, None, noise_dof)
-    assert apart == pytest.approx(10 * DIFFERENCE_LEVEL / 2)
-    assert bound == pytest.approx(alone.isf(DIFFERENCE_LEVEL / 40))
+    assert apart == pytest.approx(10 * USUAL_LEVEL / 2)
+    assert bound == pytest.approx(alone.isf(USUAL_LEVEL / 40))
