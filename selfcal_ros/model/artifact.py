@@ -144,6 +144,11 @@ class Artifact:
             grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics)
 
     @property
+    def placed(self) -> "Artifact | None":
+        """The plate itself if the map has nodes of its own, off the marks; else None."""
+        return None if self.map_grid is None else self
+
+    @property
     def lattice(self) -> "Artifact":
         """The lattice of the marks; of a list that of the error map."""
         return self if self.marks is None else self.field

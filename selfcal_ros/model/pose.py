@@ -38,6 +38,11 @@ class StagePose(ABC):
     turn_lines: float | None
 
     @property
+    def has_sites(self) -> bool:
+        """Whether grid marks lie on sites of the map, or anywhere between nodes of its own."""
+        return True
+
+    @property
     @abstractmethod
     def turn_deg(self) -> float:
         """Turn of the plate, counter-clockwise, 0 to 360 deg."""
@@ -112,6 +117,11 @@ class LatticePose(StagePose):
     quarter_turns: int | None
     shift: tuple[float, float]
     turn_lines: float | None
+
+    @property
+    def has_sites(self) -> bool:
+        """Whether the turn is a whole quarter."""
+        return self.quarter_turns is not None
 
     @property
     def q(self) -> int:

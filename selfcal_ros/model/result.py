@@ -271,7 +271,7 @@ def unidentified_result(measurements: Measurements, observability: Observability
         verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
         provenance=Provenance(version=__version__),
         run_id=measurements.run_id,
-        placed_plate=artifact if artifact.map_grid else None)
+        placed_plate=artifact.placed)
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:

@@ -18,7 +18,7 @@ were named.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -258,14 +258,14 @@ def _symmetries(marks: np.ndarray) -> Iterator[tuple[complex, complex]]:
 def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     """Return the readings of a view in the window; None if too few, or without a grid."""
     pose = view.view.on_stage(artifact)
-    if not isinstance(pose, LatticePose | PlacedPose) or not len(view.m) or (
-            isinstance(pose, LatticePose) and pose.quarter_turns is None):
+    if not pose.has_sites or not len(view.m):
         return None
     i, j = pose.site_of(*artifact.places(view.m, view.n))
     inside = np.maximum(np.abs(i), np.abs(j)) <= WINDOW + EDGE
     if inside.sum() < LEAST_READINGS:
         return None
-    return _Seen(pose, (i + 1j * j)[inside], (view.dx + 1j * view.dy)[inside], view.count[inside])
+    return _Seen(cast(LatticePose | PlacedPose, pose), (i + 1j * j)[inside],
+                 (view.dx + 1j * view.dy)[inside], view.count[inside])
 
 
 def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:

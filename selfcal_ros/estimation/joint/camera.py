@@ -58,6 +58,11 @@ class Distortion:
     powers: Powers
     coefficients: np.ndarray
 
+    @property
+    def places(self) -> dict[tuple[int, int], complex]:
+        """Mean published offset in each cell where it was measured, m."""
+        return {}
+
     def at(self, offset: np.ndarray) -> np.ndarray:
         """Return the error at published offsets, complex, m: that at the true ones."""
         error = np.zeros_like(offset)
@@ -97,6 +102,11 @@ class Camera(Distortion):
     u_coefficients: np.ndarray
     noise_image: float
     noise_mark: float
+
+    @property
+    def places(self) -> dict[tuple[int, int], complex]:
+        """Mean published offset in each known cell, m."""
+        return dict(zip(self.cells, self.place + self.error, strict=True))
 
     @property
     def shown(self) -> CameraErrors:
@@ -261,8 +271,7 @@ def straightened(measurements: Measurements, camera: Distortion) -> Measurements
 
     Or that of its nominal place, if the camera was found from other readings, or without the cell.
     """
-    places = dict(zip(camera.cells, camera.place + camera.error, strict=True)) if isinstance(
-        camera, Camera) else {}
+    places = camera.places
     return replace(measurements, views=tuple(
         view if view.view.cell is None or view.visits is None
         else _straight(view, view.visits, camera, places.get(view.view.cell, view.view.cell_m))

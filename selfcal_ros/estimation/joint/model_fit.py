@@ -423,11 +423,14 @@ def told_coefficients(system: PlacedEquations) -> float:
     return 2 * (n - system.grid.vague * float(factor.inverse_diagonal().sum()))
 
 
-def is_too_large(problem: Problem) -> bool:
+def placed(problem: Problem) -> PlacedEquations | None:
+    """Return the equations of a map with nodes of its own; None on the lattice."""
+    return problem.system if isinstance(problem.system, PlacedEquations) else None
+
+
+def is_too_large(system: PlacedEquations) -> bool:
     """Return whether a map has too many nodes for a finer one."""
-    system = problem.system
-    return isinstance(system, PlacedEquations) and (
-        math.prod(system.grid.views.spline.refined.shape) > MAX_FULL)
+    return math.prod(system.grid.views.spline.refined.shape) > MAX_FULL
 
 
 def equations_left(grid: PlacedSystem) -> int:
@@ -438,9 +441,9 @@ def equations_left(grid: PlacedSystem) -> int:
 
 def is_untested(problem: Problem) -> bool:
     """Return whether no finer map can test the nodes of a map, if it has nodes of its own."""
-    system = problem.system
-    if not isinstance(system, PlacedEquations) or is_too_large(problem):
-        return isinstance(system, PlacedEquations)
+    system = placed(problem)
+    if system is None or is_too_large(system):
+        return system is not None
     views, left = system.grid.views, equations_left(system.grid)
     if views.spline.axes[0].degree == 1 or left > 2 * math.prod(views.spline.refined.shape):
         return False
@@ -455,8 +458,8 @@ def finer(model: ModelFit) -> ModelFit | None:
     With the refined map, or, of a bilinear one, with a bicubic that fits better: of its nodes, or
     refined. None on the lattice, for a map that is too large, or if no reading is left to test it.
     """
-    system = model.problem.system
-    if not isinstance(system, PlacedEquations) or is_too_large(model.problem):
+    system = placed(model.problem)
+    if system is None or is_too_large(system):
         return None
     views = system.grid.views
     splines = [views.spline.refined]
@@ -473,8 +476,8 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
 
     None on the lattice, or if the readings leave no noise by which to weight the terms.
     """
-    problem, system = model.problem, model.problem.system
-    if not isinstance(system, PlacedEquations):
+    problem, system = model.problem, placed(model.problem)
+    if system is None:
         return None
     grid = system.grid
     other = FinerEquations(PlacedSystem(grid.views.poses, grid.weight, spline, grid.rotations),

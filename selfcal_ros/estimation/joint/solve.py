@@ -9,7 +9,7 @@ that term were known, or to the free terms together.
 """
 
 import math
-from collections.abc import Collection, Sized
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -32,7 +32,7 @@ from selfcal_ros.estimation.datum.covariance import (
     scale_of,
 )
 from selfcal_ros.estimation.joint.images import IMAGES, image_noise
-from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model
+from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model, placed
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
     MAX_STRUCTURED,
@@ -49,7 +49,7 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import NormalEquations, PlacedEquations, system_for
+from selfcal_ros.estimation.normal.equations import NormalEquations, system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
@@ -300,7 +300,7 @@ def factors_of(result: CalibrationResult) -> np.ndarray:
     wrong = "no factors of this lattice"
     factors = kept_numbers(result.extra[KEY], "factors", (-1, *shape), KEY, wrong)
     terms = result.extra[KEY].get("terms")
-    if not isinstance(terms, Sized) or len(factors) != len(terms):
+    if np.shape(terms) != (len(factors),):
         raise not_kept(KEY, wrong)
     return factors
 
@@ -503,7 +503,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(
             model, {term.name for term in options.terms})),
-        placed_plate=measurements.artifact if measurements.artifact.map_grid else None)
+        placed_plate=measurements.artifact.placed)
     return Solved(result, found.xy, found.theta, model, axes)
 
 
@@ -666,7 +666,7 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     # the plate's covariance takes a factor of its own, as large as that of the stage
     if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
-        if system.grid.n_sites <= MAX_STRUCTURED and not isinstance(system, PlacedEquations):
+        if system.grid.n_sites <= MAX_STRUCTURED and placed(problem) is None:
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:

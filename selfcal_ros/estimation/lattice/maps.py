@@ -412,8 +412,13 @@ class PlacedViews(LatticeViews):
                                 & nodes[i + 1, j + 1])
 
 
+def by_kind(poses: tuple[AnyPose, ...]) -> tuple[tuple[LatticePose, ...], tuple[MapPose, ...]]:
+    """Return the poses on the lattice, and those of a map with nodes of its own: all are of one."""
+    return (tuple(pose for pose in poses if isinstance(pose, LatticePose)),
+            tuple(pose for pose in poses if isinstance(pose, MapPose)))
+
+
 def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> LatticeViews:
     """Return the maps of views of a plate with `shape` marks."""
-    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
-    return PlacedViews(placed) if placed else LatticeViews(
-        shape, tuple(pose for pose in poses if isinstance(pose, LatticePose)))
+    lattice, placed = by_kind(poses)
+    return PlacedViews(placed) if placed else LatticeViews(shape, lattice)

@@ -180,11 +180,10 @@ def angular_data(measurements: Measurements) -> AngularData:
 
 
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
-    pose = pose_of(readings.view, artifact)
-    if isinstance(pose, LatticePose) and pose.quarter_turns is None:
+    if not readings.view.on_stage(artifact).has_sites:
         raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
                          "not a multiple of 90 deg", "turn by a multiple of 90 deg")
-    return pose
+    return pose_of(readings.view, artifact)
 
 
 def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: AnyPose, *,

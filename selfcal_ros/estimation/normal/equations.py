@@ -23,7 +23,7 @@ from scipy.sparse import csr_matrix, diags
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
-from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews
+from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews, by_kind
 from selfcal_ros.estimation.lattice.readings import (
     AngularData,
     AnyPose,
@@ -35,7 +35,6 @@ from selfcal_ros.estimation.lattice.readings import (
 from selfcal_ros.estimation.normal.angular import GAP, KNOWN, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
 TRACE = 1e-6
@@ -669,11 +668,10 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
 def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
                rank_only: bool = False) -> NormalEquations:
     lines = lines_of(angular)
-    placed = tuple(pose for pose in grid.poses if isinstance(pose, MapPose))
+    poses, placed = by_kind(grid.poses)
     if placed:
         return PlacedEquations(PlacedSystem(placed, grid.weight, rotations=grid.rotations), lines,
                                grid.index, angular.index)
-    poses = tuple(pose for pose in grid.poses if isinstance(pose, LatticePose))
     return NormalEquations(GridSystem(poses, grid.weight, rotations=grid.rotations), lines,
                            grid.index, angular.index, rank_only=rank_only)
 

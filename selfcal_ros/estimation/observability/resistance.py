@@ -145,8 +145,7 @@ class PlannedTerms:
         try:
             self.require_told(seen)
         except NotIdentifiableError as error:
-            found = error.observability
-            return found if isinstance(found, Observability) else seen
+            return error.observability
         free = int(self.of_model.free.sum())
         return replace(seen, rank=seen.rank + free, unknowns=seen.unknowns + free)
 

@@ -187,8 +187,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
                         enlarged_by=plate.result.verdict.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
         reference=plate.reference, provenance=provenance_of(measurements, options),
-        placed_plate=readings.measurements.artifact if readings.measurements.artifact.map_grid
-        else None, recheck=found)
+        placed_plate=readings.measurements.artifact.placed, recheck=found)
     return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
 
 

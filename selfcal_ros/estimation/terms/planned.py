@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import ndtri
 
 from selfcal_ros.blocks import block_of
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks, term_columns
 from selfcal_ros.estimation.terms.equations import (
@@ -24,7 +23,6 @@ from selfcal_ros.estimation.terms.equations import (
 )
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 from selfcal_ros.model.view import (
     DEFAULT_ORDER,
@@ -133,8 +131,7 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    pose = view.on_stage(artifact)
-    phase = PHASES[-pose.q % 4] if isinstance(pose, LatticePose) else view.pose.phase.conjugate()
+    phase = complex(view.pose.phase).conjugate()
     mark = artifact.flat(found.m, found.n)
     near = mark if artifact.marks else artifact.flat(*(
         np.clip(at, *ends).astype(int)  # the nearest, off the lattice

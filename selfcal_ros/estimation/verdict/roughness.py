@@ -19,6 +19,7 @@ from selfcal_ros.estimation.joint.model_fit import (
     ModelFit,
     equations_left,
     is_too_large,
+    placed,
     told_coefficients,
     with_map,
 )
@@ -106,8 +107,8 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     model : ModelFit
         A fit; finite rotations and terms are taken off its readings.
     """
-    system = model.problem.system
-    if not isinstance(system, PlacedEquations) or is_too_large(model.problem):
+    system = placed(model.problem)
+    if system is None or is_too_large(system):
         return None
     grid, coarse = system.grid, _of_marks(model)
     other = with_map(model, grid.views.spline.refined)
