@@ -4,8 +4,10 @@
 There, nothing is locked and no interrupt is held back; bags and results are worked on all the same.
 """
 
+import contextlib
 import os
 import signal
+from collections.abc import Iterator
 
 try:
     import fcntl  # not on Windows
@@ -36,3 +38,17 @@ def hold_interrupts(*, held: bool) -> None:
     """Block Ctrl-C in this thread, or let it through, at once if it came meanwhile."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up."""
+    def end(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+    ends = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.signal(number, end) for number in ends}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

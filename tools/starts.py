@@ -17,7 +17,8 @@ from pathlib import Path
 
 import yaml
 
-from selfcal_ros.cli.processes import domain, ended_by_signals, process
+from selfcal_ros.cli.processes import domain, process
+from selfcal_ros.portable import ended_by_signals
 
 ROOT = Path(__file__).parents[1]
 NODES = ("measurement_collector", "solver", "pose_sequencer", "stage_simulator")

@@ -4,9 +4,10 @@
 import argparse
 import contextlib
 
-from selfcal_ros.cli.processes import ended_by_signals, eyes
+from selfcal_ros.cli.processes import eyes
 from selfcal_ros.cli.terminal import add_json, say
 from selfcal_ros.errors import ExitCode
+from selfcal_ros.portable import ended_by_signals
 
 REQUESTS = ("start", "confirm", "redo", "skip", "abort")
 

@@ -10,13 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from selfcal_ros.cli.camera import pose_text
-from selfcal_ros.cli.processes import ended_by_signals, need_ros, process, ros_arguments
+from selfcal_ros.cli.processes import need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
 from selfcal_ros.outputs import write_bytes
+from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.drawing import circled
 
@@ -62,7 +63,8 @@ def _try(args: argparse.Namespace) -> int:
     """Look, move after a yes, write what was found into CELL.yaml."""
     cell = read_cell(args.cell)
     output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
-    with connected(cell, lambda line: print(line, file=aside(args))) as machine:
+    with (ended_by_signals(),
+          connected(cell, lambda line: print(line, file=aside(args))) as machine):
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
         pixels, marks = trial.look()
         print("position: " + ", ".join(f"{axis} {value + 0.0:.6g}" for axis, value in zip(

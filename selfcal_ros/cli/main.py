@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 
 from selfcal_ros import __version__
 from selfcal_ros.cli.arguments import add_force, check_existing, misplaced
+from selfcal_ros.cli.terminal import say_no_more
 from selfcal_ros.cli.verbs import (
     EXAMPLES,
     GROUPS,
@@ -112,7 +113,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # whoever read has enough
-        _say_no_more()
+        say_no_more(sys.stdout, sys.stderr)
         return int(ExitCode.DONE)
 
 
@@ -158,16 +159,8 @@ def _refused(line: str, code: int) -> int:
     try:
         print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:
-        _say_no_more()
+        say_no_more(sys.stdout, sys.stderr)
     return int(code)
-
-
-def _say_no_more() -> None:
-    """Let everything that is still printed go nowhere, also at the end of the process."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):
-        os.dup2(nowhere, stream.fileno())
-    os.close(nowhere)
 
 
 def _remedy(module: str | None) -> str:

@@ -2,13 +2,14 @@
 """``selfcal measure``: a plan measured by a machine without ROS, from the plate to the report."""
 
 import argparse
+import contextlib
 import math
 import sys
 from pathlib import Path
 from typing import TextIO
 
 from selfcal_ros.cli import solve, verify
-from selfcal_ros.cli.terminal import add_json, aside
+from selfcal_ros.cli.terminal import add_json, aside, say_no_more
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.collection.settings.estimator import read_plan
@@ -16,6 +17,7 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.machine.cell import connected, read_cell
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
+from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
 from selfcal_ros.units import MM_PER_M, NM_PER_M
 
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{cell.path}: placing", "--yes, but a person places the plate",
                          "write placing: robot, or leave out --yes")
     try:
-        with connected(cell, desk.say) as machine:
+        with ended_by_signals(), connected(cell, desk.say) as machine:
             work = Run(plan, cell, machine, bag, desk)
             work.require()
             work.measure(resume=args.resume)
@@ -59,9 +61,10 @@ def run(args: argparse.Namespace) -> int:
         kept = "; what was measured is kept, --resume continues" if bag.exists() else ""
         kind = NoDataError if isinstance(error, NoDataError) else InputError
         raise kind(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):
         desk.end()
-        print(f"selfcal measure: stopped; {bag} is kept, --resume continues", file=sys.stderr)
+        with contextlib.suppress(OSError):  # of a terminal that is closed
+            print(f"selfcal measure: stopped; {bag} is kept, --resume continues", file=sys.stderr)
         raise
     desk.end()
     if plan.verify:
@@ -126,7 +129,7 @@ class Terminal:
         if self._is_silent:
             return ""
         try:
-            print(text, end="", file=self._stream, flush=True)
+            self._print(text, end="")
             return input().strip()
         except EOFError:
             raise KeyboardInterrupt from None
@@ -135,7 +138,7 @@ class Terminal:
         """Show coverage, noise and rejections in one line."""
         line = progress_line(progress)
         if self._stream.isatty():
-            print(f"\r\x1b[2K{line[:100]}", end="", file=self._stream, flush=True)
+            self._print(f"\r\x1b[2K{line[:100]}", end="")
             self._is_open = True
         elif progress.complete:
             self.say(line)
@@ -143,13 +146,21 @@ class Terminal:
     def say(self, line: str) -> None:
         """Show a line."""
         self.end()
-        print(line if can_print_symbols(self._stream) else to_ascii(line), file=self._stream)
+        self._print(line)
 
     def end(self) -> None:
         """Leave the line that is overwritten."""
         if self._is_open:
-            print(file=self._stream)
+            self._print("")
         self._is_open = False
+
+    def _print(self, text: str, end: str = "\n") -> None:
+        """Print; where nobody reads it any longer, the measurement goes on."""
+        try:
+            print(text if can_print_symbols(self._stream) else to_ascii(text), end=end,
+                  file=self._stream, flush=True)
+        except OSError:
+            say_no_more(self._stream)
 
 
 def progress_line(progress: ViewProgress) -> str:

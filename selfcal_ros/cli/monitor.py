@@ -15,10 +15,11 @@ import tty
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from selfcal_ros.cli.processes import Eyes, ended_by_signals, eyes
+from selfcal_ros.cli.processes import Eyes, eyes
 from selfcal_ros.cli.screen import KEYS, saved_as, screen, what_now
 from selfcal_ros.cli.terminal import add_json
 from selfcal_ros.errors import printable
+from selfcal_ros.portable import ended_by_signals
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

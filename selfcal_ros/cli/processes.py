@@ -111,19 +111,6 @@ def stop(child: subprocess.Popen) -> None:
                 stream.close()
 
 
-@contextlib.contextmanager
-def ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up."""
-    def end(number: int, _: object) -> None:
-        raise SystemExit(128 + number)
-    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 REACHES_OTHERS = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER", "FASTRTPS_DEFAULT_PROFILES_FILE",
                   "FASTDDS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI")
 """Variables of the environment that can lead nodes beyond this machine."""

@@ -19,7 +19,7 @@ from selfcal_ros.bagio.offline import (
     bag_lines,
     collect_bag,
 )
-from selfcal_ros.cli.processes import domain, ended_by_signals, need_ros, process
+from selfcal_ros.cli.processes import domain, need_ros, process
 from selfcal_ros.cli.terminal import (
     add_json,
     add_parameters,
@@ -39,6 +39,7 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_json, write_yaml
 from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
+from selfcal_ros.portable import ended_by_signals
 from selfcal_ros.topics import INPUT_TOPICS
 
 AS_RECORDED = -1

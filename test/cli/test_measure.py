@@ -4,6 +4,7 @@
 import io
 import json
 import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from selfcal_ros.cli.main import main
 from test.support.cells import CELL, PLAN, write_cell
 from test.support.power_cuts import Cut, detections, measured, outcome, prepare
+from test.support.terminals import SELFCAL
 
 LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 
@@ -65,3 +67,56 @@ def test_nobody_who_could_answer(tmp_path, capsys, monkeypatch, words, cell, sai
                  str(tmp_path / "bag"), *words]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "bag").exists()
+
+
+def test_a_measurement_goes_on_when_nobody_reads_it(tmp_path):
+    """As in `selfcal measure ... | head -1`."""
+    write_cell(tmp_path)
+    command = [*SELFCAL, "measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE) as measure:
+        measure.stdout.readline()
+        measure.stdout.close()
+        assert measure.stderr.read() == b""
+    assert measure.returncode == 0
+    assert json.loads((tmp_path / "bag.json").read_text())["views"][2]["used"]
+
+
+LEFT_ALONE = """
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+from selfcal_ros.machine.simulated import SimulatedMachine
+
+
+class LeftAlone(SimulatedMachine):
+    moves = 0
+
+    def move_to(self, position):
+        LeftAlone.moves += 1
+        super().move_to(position)
+        if LeftAlone.moves == 9:
+            os.kill(os.getpid(), signal.SIGNAL)
+
+    def stop(self):
+        super().stop()
+        Path("stopped.txt").touch()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_stops_the_stage_and_keeps_the_bag(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    write_cell(tmp_path)
+    machine = f"left_alone_{name}"
+    Path(f"{machine}.py").write_text(LEFT_ALONE.replace("SIGNAL", name))
+    Path("cell.yaml").write_text(Path("cell.yaml").read_text().replace(
+        "machine: simulated\nsimulated:", f"machine: {machine}:LeftAlone\nLeftAlone:"))
+    with pytest.raises(SystemExit) as ended:
+        main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"])
+    assert ended.value.code == 128 + signal.Signals[name]
+    assert "stopped; bag is kept, --resume continues" in capsys.readouterr().err
+    assert Path("stopped.txt").exists()
+    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]) == 0
