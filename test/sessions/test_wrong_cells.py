@@ -4,6 +4,7 @@
 Each wrong cell fails; the first line names its fault, and what follows from it is told as such.
 """
 
+from itertools import islice
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +29,7 @@ class Cell(Bench):
         super().__init__(seed=4, **kwargs)
         self.fault, self.hands, self.check = fault, hands, None
         self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
+        self.planned = iter(())  # a view without an end is exposed only until it is aborted
         self.view, self.position, self.late = None, self.home, []  # in transit
 
     def obey(self, fields):
@@ -37,14 +39,19 @@ class Cell(Bench):
         stamp = stamp["sec"] * 10**9 + stamp["nanosec"]
         if stamp <= self.acted or (self.fault == "ignores ABORT" and view.phase == ABORT):
             return
-        self.acted, self.work = stamp, []
+        self.acted, self.work, self.planned = stamp, [], iter(())
         if view.phase == PLACE:
             self.lay()
         elif view.phase == MEASURE:
             if self.fault == "another view":
                 view.rotation += np.pi / 2
-            self.view, self.work = view, list(self.exposures(view))
+            self.view, self.planned = view, self.exposures(view)
+            self.take_next()
             self.begun_s = self.hands.seconds
+
+    def take_next(self):
+        """Plan the next stop of the view."""
+        self.work += islice(self.planned, 1)
 
     def see_again(self, fields):
         """Measure what a status names as missing."""
@@ -63,6 +70,7 @@ class Cell(Bench):
             self.check.take_detection(self.late.pop(0)[1])
         if self.work and now >= self.begun_s + PERIOD_S / 2:
             _, seen = self.work.pop(0)
+            self.take_next()
             self.begun_s = now + PERIOD_S / 2
             self.show(seen, now - TICK_S / 2)
 
