@@ -73,8 +73,10 @@ def canonical(detections: np.ndarray) -> np.ndarray:
 
 
 def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
-          ) -> tuple[np.ndarray, Counter]:
-    """Return usable detections in canonical order, each once, and reasons of rejection.
+          ) -> tuple[np.ndarray, np.ndarray, Counter]:
+    """Return usable detections, those of a low score, and how many were rejected for what reason.
+
+    Both in canonical order, each once.
 
     Parameters
     ----------
@@ -105,20 +107,20 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
         good[mine] = good_sigmas(unique["sigma"][mine])
     rejected[Reason.BAD_SIGMA] = int((~good).sum())
     unique = _where(good, unique)
+    low = unique[:0]
     if scored:
-        low = unique["score"] < rules.min_score
-        rejected[Reason.LOW_SCORE] += int(low.sum())
-        unique = _where(~low, unique)
-    return unique, +rejected
+        below = unique["score"] < rules.min_score
+        low, unique = unique[below], _where(~below, unique)
+        rejected[Reason.LOW_SCORE] = len(low)
+    return unique, low, +rejected
 
 
-def with_low_scores(readings: ViewReadings, detections: np.ndarray, *, exposures: Exposures,
-                    rules: Rules) -> ViewReadings:
+def with_low_scores(readings: ViewReadings, low: np.ndarray,
+                    exposures: Exposures) -> ViewReadings:
     """Return `readings` with the positions of grid detections rejected for a low score."""
-    low = detections[(detections["kind"] == Kind.GRID) & (detections["score"] < rules.min_score)]
+    low = low[low["kind"] == Kind.GRID]
     if not len(low):
         return readings
-    low = low[np.argsort(low["stamp"], kind="stable")]  # whatever the order of arrival
     stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
     places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object),
                np.stack([stage.x.position, stage.y.position]))

@@ -348,12 +348,10 @@ class ViewCache:
     def _reduce(self, timeline: Timeline, index: int, exposures: Exposures) -> ViewReadings:
         rows = np.flatnonzero(self.view_of == index)
         detections = self.table[_as_slice(rows)]
-        good, reasons = clean(detections, self._rules, scored=self._scored)
+        good, low, reasons = clean(detections, self._rules, scored=self._scored)
         readings = reduce_view(*timeline.planned_view(index), good,
                                exposures=exposures, rules=self._rules)
-        if self._scored:
-            readings = with_low_scores(readings, detections, exposures=exposures,
-                                       rules=self._rules)
+        readings = with_low_scores(readings, low, exposures)
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})
         return with_rejections(readings, dict(sorted(total.items())))

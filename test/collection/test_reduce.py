@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.collection.inputs import Kind, Reason
 from selfcal_ros.collection.reduce import PlaceList
+from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import RejectedPlaces, Sense
 from test.support.collecting import collect, scene, table
 
@@ -93,6 +94,18 @@ def test_the_place_of_a_rejected_grid_detection_is_where_the_stage_stood(fault, 
     assert places.reason == (str(reason),)
     assert places.x == pytest.approx([sign * m * PITCH], abs=1e-4)
     assert places.y == pytest.approx([sign * n * PITCH], abs=1e-4)
+
+
+@pytest.mark.parametrize("fault", ["nan x", "sigma of 1e4", "absurdly far"])
+def test_of_a_detection_with_two_faults_the_first_is_counted_and_has_the_place(fault):
+    """Each place has a reason that is counted, or the message to the solver cannot be made."""
+    spoilt = scene()
+    spoilt.spoil(spoilt.grid(7), **GRID_FAULTS[fault][0], score=0.0)
+    measurements, progress = collect(spoilt.events)
+    assert measurements.all_rejected() == {str(GRID_FAULTS[fault][1]): 1}
+    assert measurements.views[0].places.reason == ()
+    fields = from_model.view_measurement(progress[0], measurements, 5, "stage")
+    assert list(fields["rejected_reason"]) == []
 
 
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
