@@ -67,7 +67,7 @@ ROUGH_RESOLUTION = 1e-11
 LATE, OF_NOISE_LATE = 20, 0.1
 """Steps after which rounding is all that moves, and the change, against its standard uncertainty,
 that is none from then on: plates laid millimetres beside their places make the offsets, and their
-rounding, as large."""
+rounding, as large. An iteration whose smallest change lies as many steps back goes in circles."""
 
 FEW_DOF = 10
 """Degrees of freedom of grid residuals below which those of lines count for the noise as well."""
@@ -163,6 +163,7 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
     before, peak = np.inf, float(np.abs(problem.grid.y).max())
+    smallest, found_at = np.inf, 0
     for number in range(MAX_STEPS):
         change = state.step()
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
@@ -173,7 +174,9 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         if stuck and (change <= max(ROUGH_RESOLUTION * largest, FLOOR)
                       or state.within_noise(part)):
             return state.finished()
-        if change > DIVERGES * peak:
+        if change < smallest:
+            smallest, found_at = change, number
+        if change > DIVERGES * peak or number - found_at >= LATE:
             break
         before = change
     if problem.terms:

@@ -6,7 +6,7 @@ from math import pi
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, NotSettledError
 from selfcal_ros.estimation.joint import model_fit
 from selfcal_ros.estimation.joint.model_fit import fit_model, squares
 from selfcal_ros.estimation.joint.problem import own_rotations
@@ -84,6 +84,31 @@ def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     with pytest.raises(InputError) as caught:
         fit_model(prepare(readings, bare(terms=parse_terms([terms], "")))[0])
     assert str(caught.value) == message
+
+
+def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
+    plan, rng = plan_with(0, 0), np.random.default_rng(6)
+    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng)
+    problem = prepare(readings, BARE)[0]
+    step, steps = model_fit._State.step, []
+
+    def run_with(changes):
+        steps.clear()
+
+        def told(state):
+            step(state)
+            change = changes(len(steps))
+            steps.append(change)
+            state.moved_m, state.changed_m = np.full(state.problem.system.size, change), change
+            return change
+        monkeypatch.setattr(model_fit._State, "step", told)
+        return fit_model(problem)
+
+    with pytest.raises(NotSettledError):
+        run_with(lambda number: (3e-6, 2e-6, 4e-6)[number % 3])
+    assert len(steps) == 1 + 1 + model_fit.LATE
+    run_with(lambda number: 1e-6 * 0.75**number)
+    assert len(steps) > 2 * model_fit.LATE and steps[-1] < 1e-12
 
 
 def test_the_rotation_that_a_view_shows_of_its_own_is_that_of_its_marks_about_their_middle():
