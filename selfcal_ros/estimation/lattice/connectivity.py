@@ -33,6 +33,11 @@ class Components:
     of_mark: np.ndarray
     balanced: np.ndarray
 
+    @classmethod
+    def of_one(cls, sites: np.ndarray, marks: np.ndarray) -> "Components":
+        """Return one component, without a free vector, of the nodes in bool arrays."""
+        return cls(np.where(sites, 0, -1), np.where(marks, 0, -1), np.zeros(1, dtype=bool))
+
     @property
     def first_sites(self) -> np.ndarray:
         """The first site of every component, int (components,)."""

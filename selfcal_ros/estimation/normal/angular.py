@@ -33,13 +33,16 @@ class AngularSystem:
         Total turn of each angular view, in lines.
     weight : float array (views, K)
         Weight of each reading; 0 = not read.
+    known_plate : bool
+        Whether the plate is known, so that none of its lines is eliminated.
     """
 
-    def __init__(self, turns: tuple[float, ...], weight: np.ndarray) -> None:
-        self.turns, self.weight = turns, weight
+    def __init__(self, turns: tuple[float, ...], weight: np.ndarray, *,
+                 known_plate: bool = False) -> None:
+        self.turns, self.weight, self.known_plate = turns, weight, known_plate
         self.read = weight > 0
         total = weight.sum(axis=0)
-        self.relative_weight = weight / np.where(total > 0, total, 1.0)
+        self.relative_weight = weight / np.where(total > 0, total, 1.0) * (not known_plate)
         lines = np.arange(weight.shape[1])
         self.site = (lines + np.rint(turns).astype(int)[:, None]) % max(len(lines), 1)
         """Stage line of each plate line in each view, or the nearest one, (views, K)."""
@@ -75,6 +78,9 @@ class AngularSystem:
     def components(self) -> Components:
         """Components of the graph of stage lines and plate lines: each has a free constant."""
         view, line = np.nonzero(self.read)
+        if self.known_plate:
+            return Components.of_one(np.isin(np.arange(self.n_lines), self.site[view, line]),
+                                     np.zeros(self.n_lines, dtype=bool))
         return components(self.site[view, line], line, np.zeros(len(line), dtype=int),
                           n_sites=self.n_lines, n_marks=self.n_lines)
 
@@ -122,7 +128,8 @@ class AngularSystem:
                 cols.append(self.site[j])
                 values.append(value)
         parts = self.components
-        pins = np.concatenate([np.flatnonzero(parts.of_site < 0), parts.first_sites])
+        pins = np.concatenate([np.flatnonzero(parts.of_site < 0),
+                               parts.first_sites[parts.balanced]])
         rows.append(pins)
         cols.append(pins)
         values.append(np.full(len(pins), self.weight.sum() / max(self.n_readings, 1)))
@@ -195,10 +202,13 @@ class HarmonicSystem(AngularSystem):
         Weight of each reading; 0 = not read.
     harmonics : int
         H.
+    known_plate : bool
+        As of `AngularSystem`.
     """
 
-    def __init__(self, turns: tuple[float, ...], weight: np.ndarray, harmonics: int) -> None:
-        super().__init__(turns, weight)
+    def __init__(self, turns: tuple[float, ...], weight: np.ndarray, harmonics: int, *,
+                 known_plate: bool = False) -> None:
+        super().__init__(turns, weight, known_plate=known_plate)
         self.harmonics = harmonics
         line = 2 * np.pi / self.n_lines
         places = (np.arange(self.n_lines) + np.array(turns, dtype=float)[:, None]) * line

@@ -300,8 +300,8 @@ class NormalEquations:
 
     @cached_property
     def gauge(self) -> Gauge:
-        """Datum of the stage."""
-        return Gauge(self.grid.views.z_sites, self.known_sites, scale=True)
+        """Datum of the stage: its scale is a convention, unless the plate is known."""
+        return Gauge(self.grid.views.z_sites, self.known_sites, scale=not self.grid.known_plate)
 
     @cached_property
     def plate_gauge(self) -> Gauge:
@@ -377,6 +377,9 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     return angular.plate(y, free - angular.response @ phi, phi)[1]
 
 
+MOST_DATUMS = 12
+"""Most datums from that of the core to that of the known nodes."""
+
 CORE = 0.75
 """Distance from the centre, in half widths, within which nodes fix the first datum."""
 
@@ -446,7 +449,7 @@ class PlacedSystem(GridSystem):
         Weight of each reading; 0 = not read.
     spline : MapSpline, optional
         Of the map, if it is not the one through its nodes.
-    rotations : tuple of int
+    rotations, known_plate
         As of `GridSystem`.
 
     Raises
@@ -458,8 +461,9 @@ class PlacedSystem(GridSystem):
     views: PlacedViews
 
     def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray,
-                 spline: MapSpline | None = None, rotations: tuple[int, ...] = ()) -> None:
-        super().__init__((), weight, rotations=rotations)
+                 spline: MapSpline | None = None, rotations: tuple[int, ...] = (), *,
+                 known_plate: bool = False) -> None:
+        super().__init__((), weight, rotations=rotations, known_plate=known_plate)
         self.views = PlacedViews(poses, spline)
 
     @cached_property
@@ -467,10 +471,9 @@ class PlacedSystem(GridSystem):
         """One component of all nodes with readings near them, without a free vector."""
         read = [rows[weight.ravel() > 0] for rows, weight in zip(
             self.views.rows, self.weight, strict=True)]
-        touched = np.unique(np.concatenate([rows.indices[rows.data != 0] for rows in read]))
-        of_site = np.full(self.n_sites, -1)
-        of_site[touched] = 0
-        return Components(of_site, np.where(self.mark_read.ravel(), 0, -1), np.zeros(1, bool))
+        touched = np.concatenate([rows.indices[rows.data != 0] for rows in read])
+        return Components.of_one(np.isin(np.arange(self.n_sites), touched),
+                                 self.mark_read.ravel() & (not self.known_plate))
 
     @cached_property
     def unchecked(self) -> np.ndarray:
@@ -558,13 +561,17 @@ class PlacedEquations(NormalEquations):
         known = some & (np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE)
         if known.sum() < 3:  # three nodes a side
             known = some
-        for _ in range(2):
-            if known.sum() < 3:
-                return np.zeros(views.shape, dtype=bool)
-            datum = Gauge(views.z_sites, known, scale=True)
-            largest = np.maximum(*self._variances(datum, inverse))
-            known = some & (largest.reshape(views.shape) < KNOWN**2)
-        return known
+        settled = 0
+        for _ in range(MOST_DATUMS):
+            if known.sum() < 3 or settled == 2:
+                break
+            datum = Gauge(views.z_sites, known, scale=not self.grid.known_plate)
+            largest = np.maximum(*self._variances(datum, inverse)).reshape(views.shape)
+            best = largest[some].min()
+            settled += int(best < KNOWN**2)
+            # if the core itself has nodes that are not determined: the datum of the better ones
+            known = some & (largest < (KNOWN**2 if best < KNOWN**2 else 4 * best))
+        return known & (settled == 2) & (known.sum() >= 3)
 
     def _variances(self, datum: Gauge, inverse: np.ndarray) -> np.ndarray:
         """Return the variances of Gx and Gy at the nodes in a datum over some, (2, nodes).
@@ -629,7 +636,7 @@ class Marks[Pose]:
         Position of the views in the measurement.
     harmonics : int
         Of the map, if it is a Fourier series.
-    rotations : tuple of int
+    rotations, known_plate
         As of `GridSystem`.
     """
 
@@ -638,6 +645,7 @@ class Marks[Pose]:
     index: tuple[int, ...]
     harmonics: int = 0
     rotations: tuple[int, ...] = ()
+    known_plate: bool = False
 
 
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
@@ -650,7 +658,8 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     """Return the system of marks that were read, from the cache if present."""
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
-    key = (grid.weight.shape, grid.poses, grid.index, grid.rotations, angular.weight.shape,
+    key = (grid.weight.shape, grid.poses, grid.index, grid.rotations, grid.known_plate,
+           angular.weight.shape,
            angular.poses, angular.index, angular.harmonics, digest.digest())
     with _lock:
         if key in _cache:
@@ -670,17 +679,20 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
     lines = lines_of(angular)
     poses, placed = by_kind(grid.poses)
     if placed:
-        return PlacedEquations(PlacedSystem(placed, grid.weight, rotations=grid.rotations), lines,
-                               grid.index, angular.index)
-    return NormalEquations(GridSystem(poses, grid.weight, rotations=grid.rotations), lines,
-                           grid.index, angular.index, rank_only=rank_only)
+        return PlacedEquations(
+            PlacedSystem(placed, grid.weight, rotations=grid.rotations,
+                         known_plate=grid.known_plate), lines, grid.index, angular.index)
+    return NormalEquations(
+        GridSystem(poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate),
+        lines, grid.index, angular.index, rank_only=rank_only)
 
 
 def lines_of(angular: Marks[float]) -> AngularSystem:
     """Return the equations of the angular readings."""
     if angular.harmonics and angular.poses:
-        return HarmonicSystem(angular.poses, angular.weight, angular.harmonics)
-    return AngularSystem(angular.poses, angular.weight)
+        return HarmonicSystem(angular.poses, angular.weight, angular.harmonics,
+                              known_plate=angular.known_plate)
+    return AngularSystem(angular.poses, angular.weight, known_plate=angular.known_plate)
 
 
 def clear_cache() -> None:

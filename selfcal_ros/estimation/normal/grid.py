@@ -38,16 +38,18 @@ class GridSystem:
     rotations : tuple of int
         The first of the views that have the rotation of each view, see `rotations_of`. Empty: each
         view has its own.
+    known_plate : bool
+        Whether the plate is known, so that no mark is eliminated.
     """
 
     def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: float = 0,
-                 rotations: tuple[int, ...] = ()) -> None:
-        self.weight, self.rotations = weight, rotations
+                 rotations: tuple[int, ...] = (), *, known_plate: bool = False) -> None:
+        self.weight, self.rotations, self.known_plate = weight, rotations, known_plate
         self.views = LatticeViews(weight.shape[1:], poses, unit)
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
-        self.relative_weight = weight / np.where(self.mark_read, total, 1.0)
+        self.relative_weight = weight / np.where(self.mark_read, total, 1.0) * (not known_plate)
         """Share of each reading in the mean of its mark, (views, nx, ny) (method eq. 4.3)."""
 
     @property
@@ -81,6 +83,9 @@ class GridSystem:
     def components(self) -> Components:
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
+        if self.known_plate:
+            return Components.of_one(np.isin(np.arange(self.n_sites), site),
+                                     np.zeros(self.n_marks, dtype=bool))
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks,
                           turning=self._find_turning_site())
 
