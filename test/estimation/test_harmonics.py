@@ -14,6 +14,7 @@ from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.joint.problem import noise_estimate
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data
 from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
@@ -21,7 +22,8 @@ from selfcal_ros.estimation.observability.plan_check import check_plan, predict_
 from selfcal_ros.estimation.observability.rank import best_turn_deg
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import line_errors
-from selfcal_ros.estimation.recheck.views import line_rows
+from selfcal_ros.estimation.recheck.views import Effects, map_of_lines
+from selfcal_ros.estimation.terms.columns import LineColumns
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -304,12 +306,23 @@ def test_a_recheck_of_a_known_plate_finds_the_series():
     weight[0, 4] = 0
     of = rng.normal(size=2 * harmonics + 1) * [0, *[1] * 6]
     line = np.flatnonzero(weight[0])
-    y = fourier_basis((line + 3.3) * math.tau / count, harmonics) @ of + 0.7
-    rows = line_rows(turns, weight, np.eye(len(line)), harmonics)
+    y = np.zeros((1, count))
+    y[0, line] = fourier_basis((line + 3.3) * math.tau / count, harmonics) @ of + 0.7
+    plate = np.eye(count)[:, None]
+
+    def found(weight):
+        effects = Effects.of(np.repeat("known plate", count), np.ones(count), np.zeros(count),
+                             before=np.zeros((2 * count, 2 * count)), length=np.zeros(count))
+        noise = noise_estimate((1.0, 99), (math.nan, 0), math.nan)
+        return map_of_lines(HarmonicSystem(turns, weight, harmonics, known_plate=True), y,
+                            LineColumns(np.arange(count), plate), effects,
+                            sense="microscope_moves", noise=noise)
+
     lines = np.arange(count) * math.tau / count
-    np.testing.assert_allclose(rows @ y, fourier_basis(lines, harmonics) @ of, atol=1e-12)
+    np.testing.assert_allclose(found(weight).values, fourier_basis(lines, harmonics) @ of,
+                               atol=1e-12)
     weight[0, :4] = 0  # 4 lines for 7 numbers
-    assert not line_rows(turns, weight, np.eye(4), harmonics).any()
+    assert not found(weight).known.any()
 
 
 def test_the_picture_follows_the_series_between_the_lines():

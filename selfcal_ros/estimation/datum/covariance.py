@@ -420,14 +420,6 @@ class Conditions:
     gain: np.ndarray
     phi_gain: np.ndarray
 
-    @classmethod
-    def none(cls, system: NormalEquations) -> "Conditions":
-        """Return that of no datum."""
-        lines, views = system.angular.n_lines, system.angular.n_views
-        return cls(ThetaDatum.ZERO_MEAN, np.zeros((0, lines)),
-                   np.zeros((0, *system.grid.views.shape)), np.zeros((lines, 0)),
-                   np.zeros((views, 0)))
-
 
 _of_system: Memo[tuple[ThetaDatum, Sense, float], Conditions] = Memo()
 

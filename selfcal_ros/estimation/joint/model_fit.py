@@ -342,20 +342,11 @@ class _State:
         return columns.shapes.combined(self.coefficients, columns.having(trait))
 
     def _excess(self) -> np.ndarray | float:
-        """Return what finite rotations add to the linear model, in the frame of the plate, m.
-
-        What is left of the rotation there turns the plate; the rotation of the frame turns G, and
-        what the approach adds to it.
-        """
-        if not self.problem.rigid:
-            return 0.0
-        grid, length = self.problem.system.grid, self.problem.half_width_m
-        phi = self.found.parameters[:3 * grid.n_views:3, None, None] / length
-        turn = np.expm1(1j * phi)
-        frame = np.expm1(-1j * self.problem.turn_rad)[:, None, None]
-        return (turn - 1j * phi) * (grid.views.z * length) + turn * (
-            self.found.plate + self._of_terms(lambda block: block.of_plate)) + frame * (
-                grid.views.gather(self.found.field) + self._of_terms(lambda block: block.of_map))
+        """Return `Problem.excess` of the present solution."""
+        return self.problem.excess(
+            self.found.parameters, self.found.plate + self._of_terms(lambda block: block.of_plate),
+            self.problem.system.grid.views.gather(self.found.field)
+            + self._of_terms(lambda block: block.of_map))
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:

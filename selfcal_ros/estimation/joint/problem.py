@@ -12,8 +12,14 @@ import numpy as np
 from scipy.special import fdtrc, stdtrit
 
 from selfcal_ros.estimation.checks.wiring import F_LEVEL
-from selfcal_ros.estimation.datum.covariance import Conditions, scale_of, scale_of_plate
+from selfcal_ros.estimation.datum.covariance import (
+    Conditions,
+    conditions_for,
+    scale_of,
+    scale_of_plate,
+)
 from selfcal_ros.estimation.joint.images import ImageNoise
+from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
@@ -268,6 +274,27 @@ class Problem:
         """Factor from the turned plate frame of each view's readings to the stage frame."""
         return self.system.grid.views.phases / self.frames
 
+    def excess(self, parameters: np.ndarray, plate: np.ndarray,
+               stage: np.ndarray) -> np.ndarray | float:
+        """Return what finite rotations add to the linear model, frame of the plate as it lies, m.
+
+        What is left of the rotation there turns the plate; the rotation of the frame turns what the
+        stage adds.
+
+        Parameters
+        ----------
+        parameters : float array (size,)
+            Misalignments as in `NormalEquations`, m.
+        plate, stage : complex array (nx, ny) or (views, nx, ny)
+            Error of the marks, and of the stage at them in the nominal frame of the plate, m.
+        """
+        if not self.rigid:
+            return 0.0
+        grid, length = self.system.grid, self.half_width_m
+        phi = parameters[:3 * grid.n_views:3, None, None] / length
+        frame = np.expm1(-1j * self.turn_rad)[:, None, None]
+        return rotation_excess(phi, grid.views.z * length, plate) + frame * stage
+
 
 @dataclass(frozen=True, eq=False)
 class AngularPart:
@@ -389,8 +416,7 @@ def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
 
 def problem_of(measurements: Measurements, options: Options, system: NormalEquations,
                ground: TermInputs, *, readings: tuple[GridData, AngularData],
-               conditions: Conditions, terms: tuple[ModelTerm, ...], known: np.ndarray,
-               images: ImageNoise | None = None) -> Problem:
+               terms: tuple[ModelTerm, ...], images: ImageNoise | None = None) -> Problem:
     """Return the problem that readings pose, in the frame of the plate as it lies.
 
     Parameters
@@ -399,16 +425,16 @@ def problem_of(measurements: Measurements, options: Options, system: NormalEquat
         The readings and how they are solved.
     system, ground, readings
         What is made of the readings.
-    conditions, terms, images
+    terms, images
         As in `Problem`.
-    known : bool array (nx, ny)
-        Sites whose error is known.
     """
     rigid = options.finite_rotations
+    conditions = conditions_for(system, options.datum_theta, measurements.sense,
+                                ground.half_width_m)
     problem = Problem(
         system, *readings, *repeats_of(measurements), ground.half_width_m, conditions, ground,
         options.reference, rigid, terms, turn_rad=np.zeros(len(readings[0].index)),
-        places=places_of(measurements, readings[0], ground, known),
+        places=places_of(measurements, readings[0], ground, system.known_sites),
         at_places=options.at_places, images=images)
     return turned(problem) if rigid else problem
 

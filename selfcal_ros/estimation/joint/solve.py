@@ -27,7 +27,6 @@ from selfcal_ros.estimation.datum.covariance import (
     NO_NOISE_M,
     LinesCovariance,
     MapsCovariance,
-    conditions_for,
     misclosure_test,
     scale_of,
 )
@@ -452,7 +451,6 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
                                    f"({seen.deficiency} mode{'s' * (seen.deficiency != 1)} "
                                    "undetermined)", seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    conditions = conditions_for(system, options.datum_theta, measurements.sense, half_width_m)
     ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
     terms = tuple(
         term for term in options.model_terms(
@@ -463,8 +461,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         ground.yaw if any(term.block.of_images for term in terms) else None,
     ) if measurements.has_images else None
     return problem_of(measurements, options, system, ground, readings=(grid, angular),
-                      conditions=conditions, terms=terms, known=system.known_sites,
-                      images=images), seen
+                      terms=terms, images=images), seen
 
 
 def _solved(measurements: Measurements, options: Options, *, model: ModelFit,

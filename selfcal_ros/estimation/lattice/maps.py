@@ -186,7 +186,8 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
     return out
 
 
-def rotation_excess(phi_rad: float, marks: np.ndarray, plate: np.ndarray) -> np.ndarray:
+def rotation_excess(phi_rad: float | np.ndarray, marks: np.ndarray,
+                    plate: np.ndarray) -> np.ndarray:
     """Return the contribution of the rotation beyond the linear model, complex (P,), m."""
     turn = np.expm1(1j * phi_rad)
     return (turn - 1j * phi_rad) * marks + turn * plate  # method eq. 2.6

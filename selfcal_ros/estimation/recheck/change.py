@@ -214,13 +214,9 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     if common.sum() < 6:
         raise InputError(plate.where, f"only {common.sum() // 2} nodes are known in both maps",
                          "measure where its map is known")
-    values, of_new, of_old = _difference(new, common, np.kron(np.eye(2), rows), np.concatenate(
-        [old.gx[sites], old.gy[sites]]))
-    by_expansion = new.from_length[common[new.known]]
-    of_old = of_old + plate.variance_of_expansion * np.outer(by_expansion, by_expansion)
-    dof = joint_dof((np.trace(of_new), new.dof), (np.trace(of_old), plate.result.noise.dof_xy))
-    covariance = of_new + of_old
-
+    values, covariance, dof = _difference(
+        new, common, np.kron(np.eye(2), rows), np.concatenate([old.gx[sites], old.gy[sites]]),
+        plate=plate, dof=plate.result.noise.dof_xy)
     modes = datum_modes(artifact, scale=True).reshape(4, -1).T[common]
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
@@ -239,12 +235,12 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
                   None if test is None else tests)
 
 
-def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray,
-                old: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return new minus old map where both are known, and the covariances of its two sources.
+def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray, old: np.ndarray, *,
+                plate: KnownPlate, dof: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return new minus old map where both are known, its covariance and degrees of freedom.
 
-    Those of the noise of the new readings, and of the calibration: what it got wrong is in the old
-    map and, by the plate, in the new one.
+    By the noise of the new readings, and by the calibration: what it got wrong is in the old map
+    and, by the plate, in the new one; so is the expansion of the plate since.
 
     Parameters
     ----------
@@ -256,11 +252,18 @@ def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray,
         The old map there for a unit of each of its known values.
     old : float array (j,)
         These.
+    plate : KnownPlate
+        The plate.
+    dof : float
+        Degrees of freedom of the calibration.
     """
     here, rows = common[new.known], rows[common]
-    by_calibration = -np.hstack([rows, new.from_plate[here]])
-    return (new.values[here] - rows @ old, new.of_noise[np.ix_(here, here)],
-            by_calibration @ new.before @ by_calibration.T)
+    by_calibration, longer = -np.hstack([rows, new.from_plate[here]]), new.from_length[here]
+    of_new = new.of_noise[np.ix_(here, here)]
+    of_old = by_calibration @ new.effects.before @ by_calibration.T
+    of_old += plate.variance_of_expansion * np.outer(longer, longer)
+    return (new.values[here] - rows @ old, of_new + of_old,
+            joint_dof((np.trace(of_new), new.dof), (np.trace(of_old), dof)))
 
 
 def line_change(new: NewMap, plate: KnownPlate) -> Change:
@@ -270,10 +273,9 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
     out = np.full((2, count), np.nan)
     if common.sum() < 2:
         return Change(out[0], out[1], None)
-    values, of_new, of_old = _difference(new, common, np.eye(count), np.nan_to_num(old))
-    dof = joint_dof((np.trace(of_new), new.dof),
-                    (np.trace(of_old), plate.result.noise.dof_theta))
-    spread = Spread(of_new + of_old, np.ones((len(values), 1)), dof)
+    values, covariance, dof = _difference(new, common, np.eye(count), np.nan_to_num(old),
+                                          plate=plate, dof=plate.result.noise.dof_theta)
+    spread = Spread(covariance, np.ones((len(values), 1)), dof)
     values = values - values.mean()
     out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
     test = significance(values, spread)

@@ -104,15 +104,11 @@ class KnownPlate:
         return np.concatenate([lattice.x_m[marks], lattice.y_m[marks], np.zeros(4)])
 
     @property
-    def of_offsets(self) -> np.ndarray | None:
-        """Coefficients of the microscope that it found, (4,); None if it did not estimate them."""
-        term = next((term for term in self.result.model.terms
-                     if block_of(term.name).of_offsets), None)
-        if term is None:
-            return None
-        found = {each.component: each.value for each in term.estimates}
-        values = np.array([found.get(part, 0.0) for part in MICROSCOPE_PARTS])
-        return values if np.isfinite(values).all() else None
+    def of_offsets(self) -> np.ndarray:
+        """Coefficients of the microscope that it found, (4,); NaN if it did not estimate them."""
+        found = {each.component: each.value for term in self.result.model.terms
+                 if block_of(term.name).of_offsets for each in term.estimates}
+        return np.array([found.get(part, 0.0 if found else np.nan) for part in MICROSCOPE_PARTS])
 
 
 def reference_now(result: CalibrationResult, where: str, at: str) -> dict[str, Any] | None:

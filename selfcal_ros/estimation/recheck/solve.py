@@ -11,25 +11,26 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
+from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof
-from selfcal_ros.estimation.datum.covariance import Conditions
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
     MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
+    Problem,
     coverage_factor,
     noise_estimate,
     problem_of,
 )
-from selfcal_ros.estimation.joint.solve import noise_of, views_of
+from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import TRACE, system_for
+from selfcal_ros.estimation.normal.equations import TRACE, Marks, lines_of, system_of
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
@@ -39,15 +40,15 @@ from selfcal_ros.estimation.recheck.views import (
     PLATE,
     TEMPERATURE,
     TERMS,
+    Effects,
     NewMap,
     PlateReadings,
     PlateSolution,
-    ReadingNoise,
-    line_rows,
-    plate_solution,
-    stacked,
+    map_of_lines,
+    map_of_marks,
+    solve_marks,
 )
-from selfcal_ros.estimation.terms.columns import term_columns
+from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder, LineColumns
 from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
@@ -56,8 +57,6 @@ from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_mo
 from selfcal_ros.model.readings import (
     Measurements,
     ViewReadings,
-    lines_turned_over,
-    turned_over,
 )
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
@@ -65,16 +64,14 @@ from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
 
-MOST_OF_IMAGES = 3200
-"""Largest number of readings of images: their covariance is dense, 8 bytes (2 n)^2."""
-
-
 @dataclass(frozen=True, eq=False)
 class Rechecked:
     """Results from views of a known plate.
 
     Attributes
     ----------
+    measurements : Measurements
+        Views of the plate, with the nodes of its map.
     plate : KnownPlate
         The plate.
     readings : PlateReadings
@@ -87,6 +84,7 @@ class Rechecked:
         Noise of one reading of each kind.
     """
 
+    measurements: Measurements
     plate: KnownPlate
     readings: PlateReadings
     solution: PlateSolution
@@ -98,7 +96,7 @@ class Rechecked:
     @property
     def artifact(self) -> Artifact:
         """Nodes of the map."""
-        return self.readings.measurements.artifact.field
+        return self.measurements.artifact.field
 
     @cached_property
     def in_datum(self) -> NewMap:
@@ -129,10 +127,14 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
     if options.reference is not None:
         raise InputError("options", "a recheck always uses the reference length of the plate's "
                          "calibration", "leave it out")
-    readings = plate_readings(on_plate(measurements, plate), options, plate)
-    xy, theta = _noise(readings, plate)
-    new, solution = _new_map(readings, plate, xy, options)
-    return Rechecked(plate, readings, solution, new, _new_lines(readings, plate, theta), xy, theta)
+    measurements = on_plate(measurements, plate)
+    problem = _problem(measurements, options, plate)
+    xy, theta = _noise(measurements, problem, plate)
+    readings = _readings(measurements, problem, options, plate=plate, sigma=xy.sigma)
+    solution = solve_marks(readings)
+    return Rechecked(measurements, plate, readings, solution,
+                     map_of_marks(readings, solution, xy.dof),
+                     _new_lines(readings, plate, theta), xy, theta)
 
 
 @one_thread()
@@ -164,22 +166,20 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     declared = {term.name for term in options.terms}
     changes = _findings(found)
-    other = check_plate(readings.measurements, plate, solved.xy.sigma)
+    other = check_plate(solved.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
-        solution.square, solution.dof,
-        dof_of_marks(plate.result) if len(readings.stop) else solved.xy.dof)
+        solution.square, readings.dof,
+        dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof)
     if not failed and found.changed and found.passes == 1 and "drift" not in declared:
         failed = (replace(changes[0], name="changed_or_drifted"),)
-    unknowns = 2 * int(solution.known.sum()) + problem.system.grid.n_misalignments
+    unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
     terms = tuple(TermResult(
         str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
         for term in problem.terms)
-    parameters = np.full(problem.system.size, np.nan)
-    parameters[:len(solution.parameters)] = solution.parameters
     result = CalibrationResult(
         measurements.plan_id, solved.error_map(), plate.result.artifact_map,
-        views_of(measurements, problem, parameters), Observability(unknowns, unknowns, 0, True),
-        noise, measurements.all_rejected(),
+        views_of(measurements, problem, solution.parameters),
+        Observability(unknowns, unknowns, 0, True), noise, measurements.all_rejected(),
         findings=() if failed else changes,
         sense=str(measurements.sense), extra=kept_covariance(covers),
         run_id=measurements.run_id,
@@ -187,7 +187,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
                         enlarged_by=plate.result.verdict.enlarged_by),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
         reference=plate.reference, provenance=provenance_of(measurements, options),
-        placed_plate=readings.measurements.artifact.placed, recheck=found)
+        placed_plate=solved.measurements.artifact.placed, recheck=found)
     return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
 
 
@@ -204,30 +204,74 @@ def _findings(found: Recheck) -> tuple[Finding, ...]:
     return out
 
 
-def plate_readings(measurements: Measurements, options: Options,
-                   plate: KnownPlate) -> PlateReadings:
-    """Return the readings of known marks, and the terms of the model."""
+def _problem(measurements: Measurements, options: Options, plate: KnownPlate) -> Problem:
+    """Return the problem that the readings of known marks pose."""
     grid, angular = grid_data(measurements), angular_data(measurements)
     grid = replace(grid, weight=np.where(plate.together.marks, grid.weight, 0.0))
     if not grid.weight.any():
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
-    artifact, system = measurements.artifact, system_for(grid, angular)
-    length = artifact.grid_pitch_m * max(artifact.reach)
+    system = system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations,
+                             known_plate=True), Marks((), angular.weight[:0], ()))
+    length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
-    read = system.grid.components.of_site.reshape(system.grid.views.shape) >= 0
-    problem = problem_of(measurements, options, system, ground, readings=(grid, angular),
-                         conditions=Conditions.none(system), terms=terms, known=read)
-    quiet = without_noise(problem.ground, np.zeros(grid.y.shape))
-    cells = cells_seen(artifact, [measurements.views[index].view for index in grid.index])
-    if cells is not None and (count := np.count_nonzero(grid.weight)) > MOST_OF_IMAGES:
-        raise InputError(f"plan '{measurements.plan_id}'", f"{count} readings of marks in images "
-                         f"are beyond the limit of {MOST_OF_IMAGES} of a recheck",
-                         "state fewer marks in an image (image in PLAN.yaml)")
-    return PlateReadings(measurements, problem, term_columns(quiet, terms),
-                         np.nonzero(grid.weight), np.zeros(0, dtype=int) if cells is None
-                         else stops_of(cells, grid.weight > 0))
+    return problem_of(measurements, options, system, ground, readings=(grid, angular),
+                      terms=terms)
+
+
+def _readings(measurements: Measurements, problem: Problem, options: Options, *,
+              plate: KnownPlate, sigma: float) -> PlateReadings:
+    """Return the readings with what has an effect on them, for the noise of one reading, m.
+
+    The noise of a mark in images is the calibration's, and not none: the readings have to be
+    weighted.
+    """
+    if not sigma > 0:
+        raise InputError("readings", "they or those of the calibration have no noise against which "
+                         "to judge a change", "use measured readings")
+    variance, stop = sigma**2, _stops(measurements, problem)
+    if measurements.has_images:
+        variance = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
+        variance = float(np.clip(variance, TRACE * sigma**2, sigma**2))
+    read, sites = problem.system.grid.read, plate.together.sites
+    marks = read.any(axis=0)
+    of_mark = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape) * read
+    of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
+        (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0))
+    made = ColumnBuilder(without_noise(problem.ground, np.zeros(read.shape)))
+    for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
+        numbers = [made.add(dict(enumerate(shape.reshape(len(read), -1)))) for shape in shapes]
+        for axis, unit in AXES:
+            for number in numbers:
+                made.column(Column(name, SHARED, axis, 1.0), number, unit)
+    made.add_terms(problem.terms)
+    columns = made.done()
+
+    offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
+    known = columns.having(lambda block: block.of_offsets) & (
+        np.isfinite(offsets).all() and not declared)
+    parts = np.array([MICROSCOPE_PARTS.index(columns.columns[at].component)
+                      for at in np.flatnonzero(known)], dtype=int)
+    source = np.where(columns.rows([PLATE]) | known, PLATE,
+                      np.where(columns.rows([NOISE]), NOISE, TERMS))
+    start, end = 2 * int(sites.sum()), 2 * int(sites.sum() + marks.sum())
+    kept = np.append(np.arange(end), end + parts)
+    before, now = plate.together.cover(sites, marks)[np.ix_(kept, kept)], plate.field[marks]
+    effects = Effects.of(source, columns.size, np.concatenate([now.real, now.imag, offsets[parts]]),
+                         before=before, length=plate.length_at(marks)[kept[start:] - start])
+    return PlateReadings(problem, measurements.sense, columns, effects, variance)
+
+
+def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
+    """Return the stop of the stage at which each mark was read, (views, nx, ny); -1 = none."""
+    read = problem.system.grid.read
+    out = np.full(read.shape, -1)
+    cells = cells_seen(measurements.artifact,
+                       [measurements.views[index].view for index in problem.grid.index])
+    if cells is not None:
+        out[read] = stops_of(cells, read)
+    return out
 
 
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
@@ -241,15 +285,17 @@ def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     return terms
 
 
-def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
+def _noise(measurements: Measurements, problem: Problem,
+           plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Return the noise of the readings: declared, of many repeats, or that of the calibration.
 
     What detections of images declare is the noise of a mark, without that of its image.
     """
-    problem, before, nan = readings.problem, plate.result.noise, float("nan")
+    before, nan = plate.result.noise, float("nan")
     of_marks, of_mark, out = problem.repeats_xy, problem.grid.sigma_declared, []
-    if len(readings.stop):
-        fewer = 1 + (marks_of_image(readings.stop) - 1) * share_of(plate.result)
+    if measurements.has_images:
+        stop = _stops(measurements, problem)
+        fewer = 1 + (marks_of_image(stop[stop >= 0]) - 1) * share_of(plate.result)
         of_marks, of_mark = (of_marks[0], of_marks[1] / fewer), nan
     for kind, repeats, declared in (
             ("xy", of_marks, of_mark),
@@ -262,68 +308,21 @@ def _noise(readings: PlateReadings, plate: KnownPlate) -> tuple[NoiseEstimate, N
     return out[0], out[1]
 
 
-def _new_map(readings: PlateReadings, plate: KnownPlate, xy: NoiseEstimate,
-             options: Options) -> tuple[NewMap, PlateSolution]:
-    """Return the map of the stage, stage frame, and as it was solved."""
-    offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
-    calibrated = offsets is not None and not declared
-    terms = readings.of_terms(lambda block: not block.of_lines
-                              and not (calibrated and block.of_offsets))
-    of_offsets = readings.of_offsets() * calibrated
-    of_plate = np.hstack([readings.of_marks(), stacked(of_offsets)])
-    noise = _noise_of_marks(readings, plate, xy.sigma, stacked(terms))
-    sites, marks = plate.together.sites, readings.marks
-    before = plate.together.cover(sites, marks)
-    of_marks = before[2 * sites.sum():, 2 * sites.sum():]
-    solution = plate_solution(
-        readings, noise.covariance + of_plate @ of_marks @ of_plate.T,
-        plate.field[readings.at[1:]], of_offsets @ (offsets if calibrated else np.zeros(4)))
-
-    field, known = solution.field, solution.known
-    rows = solution.rows[:2 * known.size].reshape(2, *known.shape, -1)
-    sense = readings.measurements.sense
-    field, known = turned_over(sense, field), turned_over(sense, known, sign=1)
-    rows = turned_over(sense, rows, axes=(1, 2))
-    both = np.tile(known.ravel(), 2)
-    return NewMap(both, stacked(field.ravel())[both], rows.reshape(len(both), -1)[both], noise,
-                  of_plate, before, xy.dof, of_plate @ plate.length_at(marks)), solution
-
-
-def _noise_of_marks(readings: PlateReadings, plate: KnownPlate, sigma: float,
-                    terms: np.ndarray) -> ReadingNoise:
-    """Return the noise of the marks: of each mark, of what the marks of an image share, of terms.
-
-    That of a mark in images is the calibration's, and not none: the readings have to be weighted.
-    """
-    of_mark = sigma**2
-    if len(readings.stop):
-        of_mark = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
-        of_mark = float(np.clip(of_mark, TRACE * sigma**2, sigma**2))
-    return ReadingNoise(np.tile(of_mark / readings.weight, 2), {
-        NOISE: np.sqrt(sigma**2 - of_mark) * readings.of_images(), TERMS: terms})
-
-
 def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
-    angular, count = readings.problem.angular, readings.measurements.artifact.angular_count
+    angular, of_terms = readings.problem.angular, readings.columns.lines
     (_, known), before = plate.together.lines()
-    weight = np.where(known, angular.weight, 0.0)
-    view, line = np.nonzero(weight)
-    of_plate = (line[:, None] == np.arange(count)).astype(float)
-    columns = readings.columns
-    terms = columns.size[columns.lines.at] * columns.lines.values[:, view, line].T if len(
-        columns.lines.at) else np.zeros((len(view), 0))
-    noise = ReadingNoise(theta.sigma**2 / weight[view, line], {TERMS: terms})
-    rows = np.zeros((count, len(view)))
-    if len(view):
-        whole = noise.covariance + before[count:, count:][np.ix_(line, line)]
-        rows = line_rows(angular.turns, weight, whole, angular.harmonics)
-    values = rows @ (angular.y[view, line] - plate.result.artifact_map.a_theta[line])
-    values, rows = (lines_turned_over(readings.measurements.sense, part)
-                    for part in (values, rows))
-    determined = rows.any(axis=1)
-    return NewMap(determined, values[determined], rows[determined], noise, of_plate, before,
-                  theta.dof)
+    count = len(known)
+    lines = lines_of(Marks(angular.turns, np.where(known, angular.weight, 0.0), (),
+                           angular.harmonics, known_plate=True))
+    of_plate = np.broadcast_to(np.eye(count)[:, None], (count, *angular.weight.shape))
+    values = np.concatenate([of_plate, *of_terms.values[:, None]])
+    size = np.append(np.ones(count), readings.columns.size[of_terms.at])
+    source = np.where(np.arange(len(size)) < count, PLATE, TERMS)
+    effects = Effects.of(source, size, np.nan_to_num(plate.result.artifact_map.a_theta),
+                         before=before, length=np.zeros(count))
+    return map_of_lines(lines, angular.y, LineColumns(np.arange(len(size)), values), effects,
+                        sense=readings.sense, noise=theta)
 
 
 def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:

@@ -198,7 +198,7 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
     angular, n = system.angular, 3 * system.grid.n_views
     right = np.zeros((system.size, reduced.right.shape[1]))
     right[:n] = reduced.right
-    free, of_lines, gram_of_lines = _lines_eliminated(angular, lines)
+    free, of_lines, gram_of_lines = lines_eliminated(angular, lines)
     right[np.ix_(system.phi_at, lines.at)] += ratio * half_width_m * of_lines
     parameters = inverse @ right
     gram = reduced.gram - right.T @ parameters
@@ -209,7 +209,7 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
                             parameters, (gram + gram.T) / 2, turned)
 
 
-def _lines_eliminated(angular: AngularSystem,
+def lines_eliminated(angular: AngularSystem,
                       lines: LineColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what q columns make of the stage's lines, (K, q), and right-hand side and products.
 
