@@ -18,6 +18,7 @@ from selfcal_ros.estimation.comparison.maps import joint_dof
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
+    FLOOR,
     MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
@@ -227,7 +228,7 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     The noise of a mark in images is the calibration's, and not none: the readings have to be
     weighted.
     """
-    if not sigma > 0:
+    if not sigma > FLOOR:
         raise InputError("readings", "they or those of the calibration have no noise against which "
                          "to judge a change", "use measured readings")
     variance, stop = sigma**2, _stops(measurements, problem)
