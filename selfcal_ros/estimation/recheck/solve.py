@@ -55,15 +55,13 @@ from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
-from selfcal_ros.model.readings import (
-    Measurements,
-    ViewReadings,
-)
+from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
+
 
 @dataclass(frozen=True, eq=False)
 class Rechecked:

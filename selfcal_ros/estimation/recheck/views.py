@@ -14,10 +14,10 @@ import numpy as np
 from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.comparison.covariance import unit_rows
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.model_fit import told_coefficients
+from selfcal_ros.estimation.joint.model_fit import placed, told_coefficients
 from selfcal_ros.estimation.joint.problem import FLOOR, MAX_STEPS, Moving, NoiseEstimate, Problem
 from selfcal_ros.estimation.normal.angular import GAP, AngularSystem
-from selfcal_ros.estimation.normal.equations import PlacedEquations, pseudo_inverse
+from selfcal_ros.estimation.normal.equations import pseudo_inverse
 from selfcal_ros.estimation.terms.columns import LineColumns, TermColumns
 from selfcal_ros.estimation.terms.equations import lines_eliminated, reduce_columns
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
@@ -201,7 +201,7 @@ class PlateReadings:
         if known.sum() >= max(3, read / 2):
             return known
         unknown = int((~known).sum())
-        fewer = ", or give the map fewer nodes" * isinstance(system, PlacedEquations)
+        fewer = ", or give the map fewer nodes" * (placed(self.problem) is not None)
         raise NotIdentifiableError(
             f"a view of the known plate that leaves {unknown} of {n} nodes of the map "
             f"unknown: measure more of its marks{fewer}", Observability(
@@ -210,9 +210,9 @@ class PlateReadings:
     @property
     def dof(self) -> int:
         """Degrees of freedom of the residuals, the effects known."""
-        system = self.problem.system
-        rank = round(told_coefficients(system)) + system.rank_schur if isinstance(
-            system, PlacedEquations) else system.rank_grid
+        system, on_map = self.problem.system, placed(self.problem)
+        rank = system.rank_grid if on_map is None else (
+            round(told_coefficients(on_map)) + on_map.rank_schur)
         return 2 * system.grid.n_readings - rank
 
 
