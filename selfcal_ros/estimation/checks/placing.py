@@ -23,7 +23,7 @@ from typing import Any, cast
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.checks.wiring import LEAST_MOTION
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import EDGE, LatticePose, PlacedPose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
@@ -137,7 +137,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
                                weights=[view.dof_xy for view in repeated])) if repeated else 0.0
     noise, spread = _sizes(views, float(sigma))
     noise = noise if repeated else UNREPEATED * spread
-    if not spread > max(2 * noise, LEAST_MOTION):
+    if not spread > max(2 * noise, LEAST_NOISE_M):
         return None
     grid = artifact.map_grid
     sizes = max(noise, spread / 1000), spread, _alike(

@@ -42,8 +42,8 @@ BEYOND = 3.0
 
 LEAST_SLOPE = 0.3
 """Scale below which an offset is taken not to follow the stage."""
-LEAST_MOTION = 1e-12
-"""Standard deviation of a position or a misclosure, m or rad, attributed to rounding."""
+LEAST_NOISE_M = 1e-12
+"""Noise, motion or misclosure, m or rad, below which there is nothing but rounding."""
 AXES = {"grid": ("x", "y"), "angular": ("theta",)}
 
 
@@ -146,7 +146,7 @@ def sign_of_lines_is_shown(measurements: Measurements) -> bool:
         return False
     motion = _sum(motions)
     place, offset = np.diag(motion.products)
-    follows = place > LEAST_MOTION**2 * motion.dof
+    follows = place > LEAST_NOISE_M**2 * motion.dof
     return bool(follows) and (offset == 0 or (
         motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN))
 
@@ -173,7 +173,7 @@ def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
     if not motions:
         return None
     motion = _sum(motions)
-    moved = np.diag(motion.products) > LEAST_MOTION**2 * motion.dof
+    moved = np.diag(motion.products) > LEAST_NOISE_M**2 * motion.dof
     return motion if motion.dof > 1 and bool(moved.all()) else None
 
 
@@ -202,7 +202,7 @@ def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
            ) -> tuple[OffsetResponse, ...]:
     """Return the offsets that follow the stage wrongly; none if in doubt."""
     limits = HALVED, DOUBLED
-    n, least = len(axes), LEAST_MOTION**2 * motion.dof
+    n, least = len(axes), LEAST_NOISE_M**2 * motion.dof
     moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
     if not moved[:n].any() or not moved[n:].any():
         return ()

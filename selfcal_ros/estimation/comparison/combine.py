@@ -527,9 +527,8 @@ BETWEEN = "between_runs"
 SUFFIX = {"xy": "", "theta": "_theta"}
 """Ends of the names of what is stated of each map."""
 DEGREE = 3
-"""Degree up to which each polynomial of a map may vary between runs by its own."""
-HARMONICS = 3
-"""The same of the angular map, waves per turn."""
+"""Degree up to which each polynomial of a map may vary between runs by its own; waves per turn of
+the angular map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -696,7 +695,7 @@ def _polynomials(x: np.ndarray, y: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def _waves(lines: np.ndarray) -> np.ndarray:
     angle = 2 * np.pi * np.flatnonzero(lines) / len(lines)
-    return np.array([wave(k * angle) for k in range(1, HARMONICS + 1)
+    return np.array([wave(k * angle) for k in range(1, DEGREE + 1)
                      for wave in (np.cos, np.sin)]).T
 
 

@@ -41,15 +41,13 @@ from selfcal_ros.estimation.joint.solve import (
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_LINES
-from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
+from selfcal_ros.estimation.normal.equations import SMALL_MAP, Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.view import View, shared_rotations
 
-MAX_STORED = 2 * 21 * 21
-"""Largest number of coordinates whose covariance is stored: 3.5 MB."""
 COVARIANCE = "map_covariance"
 """Key of the covariance of a mean map or of a recheck: lower triangles over Gx, then Gy, of the
 known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta`
@@ -110,7 +108,7 @@ def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """
     stored: dict[str, Any] = {}
     for kind, cover in covers.items():
-        if 0 < len(cover) <= MAX_STORED:
+        if 0 < len(cover) <= 2 * SMALL_MAP:
             scale = float(np.diag(cover).mean())
             stored[kind] = rounded(cover[np.tril_indices(len(cover))] / scale).tolist()
             stored[f"scale_{kind}"] = scale

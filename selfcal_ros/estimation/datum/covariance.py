@@ -28,7 +28,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.checks.wiring import LEAST_MOTION
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import (
@@ -523,7 +523,7 @@ def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[flo
         return 1.0, 0.0
     contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
     contrast = contrasts @ misclosure
-    spread = contrasts @ covariance @ contrasts.T + LEAST_MOTION**2 * np.eye(n - 1)
+    spread = contrasts @ covariance @ contrasts.T + LEAST_NOISE_M**2 * np.eye(n - 1)
     value = float(contrast @ np.linalg.solve(spread, contrast))
     return float(chdtrc(n - 1, value)), float(np.abs(contrast).max())
 

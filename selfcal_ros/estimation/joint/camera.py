@@ -15,6 +15,7 @@ from scipy.special import fdtrc
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.joint.problem import F_LEVEL, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE
+from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
@@ -30,9 +31,6 @@ cubic ones look like linear ones in three cells."""
 
 MOST_U = 5.0
 """Largest uncertainty of the offset in a cell of a view, over their median; others are too few."""
-
-FEW = 0.5
-"""Part of the images in which the mark of a cell was read, below which its readings are few."""
 
 IN_LINE = 3e-3
 """Least part of a polynomial that places must show, of that of its largest part."""
@@ -321,8 +319,8 @@ def few_read(measurements: Measurements, camera: Camera | None) -> tuple[Finding
         of_views = {name: count for (name, at), count in counts.items() if at == cell}
         total = np.sum(list(of_views.values()), axis=0)
         few += [(name, cell, count) for name, count in (
-            [("", total)] if total[0] < FEW * total[1] else of_views.items())
-            if count[0] < FEW * count[1]]
+            [("", total)] if total[0] < DETERMINED * total[1] else of_views.items())
+            if count[0] < DETERMINED * count[1]]
     if not few:
         return ()
     unknown = None if camera is None else [

@@ -58,11 +58,9 @@ from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.terms import ModelTerm
 
-RESOLUTION = 1e-12
-"""Change of a reading, against the largest misalignment, at which rotations stand still."""
-
 ROUGH_RESOLUTION = 1e-11
-"""The same once steps no longer shrink."""
+"""Change of a reading, against the largest misalignment, at which rotations stand still once steps
+no longer shrink; before, `ROUNDED`."""
 
 LATE, OF_NOISE_LATE = 20, 0.1
 """Steps after which rounding is all that moves, and the change, against its standard uncertainty,
@@ -167,7 +165,7 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     for number in range(MAX_STEPS):
         change = state.step()
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
-        if change <= max(RESOLUTION * largest, ROUNDING * peak):
+        if change <= max(ROUNDED * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and change > SHRINKS * before
         part = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
@@ -247,7 +245,7 @@ class _State:
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
-        if np.abs(effect).max() <= RESOLUTION * largest:
+        if np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
 

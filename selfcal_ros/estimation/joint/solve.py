@@ -56,6 +56,7 @@ from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     LEAST_NOISE_M,
+    ROUNDED,
     TermEquations,
     require_terms_told,
     roots_by_term,
@@ -225,9 +226,6 @@ ANGULAR_KEY = "angular_terms"
 DIGITS = 7
 """Digits of a factor stored."""
 
-LEAST = 1e-12
-"""Entries of a factor below this are dropped, in units of the noise."""
-
 
 def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
                 beside: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
@@ -275,14 +273,14 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """Return values rounded to `DIGITS` digits, none smaller than `LEAST`.
+    """Return values rounded to `DIGITS` digits, none smaller than `ROUNDED`.
 
     As quotients of an exact power of ten, so that they print with no more digits.
     """
     size = np.abs(values)
-    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
+    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, ROUNDED)))
     power = 10.0 ** np.maximum(digits, 0.0)
-    return np.where(size < LEAST, 0.0, np.round(values * power) / power)
+    return np.where(size < ROUNDED, 0.0, np.round(values * power) / power)
 
 
 def factors_of(result: CalibrationResult) -> np.ndarray:

@@ -389,8 +389,8 @@ VAGUE = 1e-13
 LOOSE = 10.0
 """Standard uncertainty of an undetermined field, in units of the noise of one reading."""
 
-MAX_MODES = 21 * 21
-"""Largest map whose undetermined fields are sought."""
+SMALL_MAP = 21 * 21
+"""Largest map whose undetermined fields are sought, or whose covariance a result keeps: 3.5 MB."""
 
 BLOCK = 1024
 """Number of marks computed at once."""
@@ -589,11 +589,11 @@ class PlacedEquations(NormalEquations):
     def loose_modes(self) -> np.ndarray:
         """Fields with a standard uncertainty beyond `LOOSE` readings' noise, the worst first.
 
-        Complex (modes, cx, cy), of length 1; those of a map of more than `MAX_MODES` nodes are not
+        Complex (modes, cx, cy), of length 1; those of a map of more than `SMALL_MAP` nodes are not
         sought.
         """
         views, n = self.grid.views, self.grid.n_sites
-        if n > MAX_MODES:
+        if n > SMALL_MAP:
             return super().loose_modes
         inverse, response = self.grid.factor.inverse, self.grid.response
         cover = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])

@@ -37,7 +37,7 @@ DATUM_ROWS = 7
 """Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
 
 DETERMINED = 0.5
-"""Fraction of the field's sites that must be determined for a map."""
+"""Part of the sites of a field, or of the images of a cell, without which there are too few."""
 
 
 _measured: Memo[tuple[Artifact, tuple[View, ...]], Observability] = Memo()

@@ -36,6 +36,7 @@ from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import TRACE, Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (
+    PLACES,
     SLIP,
     PlacedSlip,
     cause_of,
@@ -157,9 +158,6 @@ def noisy_views(residuals: Residuals, measurements: Measurements
 AMBIGUOUS = 16.0
 """Difference of chi^2 up to which two places explain the readings equally well."""
 
-TRIED = 12
-"""Number of places, those that explain most, at which the slip is compared with the others."""
-
 SLIP_LEVEL = 1e-9
 """Level of the test of each place where the plate may have slipped."""
 
@@ -246,7 +244,7 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
     gains = [(_second_misalignment(problem, place, clipped)[1], place)
              for place in _places(problem, measurements)]
     sizes, left, places = [], [], []
-    for gain, place in sorted(gains, key=lambda tried: -tried[0])[:TRIED]:
+    for gain, place in sorted(gains, key=lambda tried: -tried[0])[:PLACES]:
         if gain >= sigma_m**2 * chdtri(3, SLIP_LEVEL):
             size, _ = _second_misalignment(problem, place, marks.residual)
             after = grid_residuals(problem.system, _slipped(problem, place, size))

@@ -7,6 +7,7 @@ plate leaves differences of marks instead: unlike a change of the stage, they ha
 from one mark to the next.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -254,7 +255,7 @@ DISTANCES = ((0.7, 1.2), (1.2, 1.7), (1.7, 2.2))
 PLANNED = (1 + 0j, 0j)
 """No further turn, no further shift."""
 
-RAYLEIGH_MEDIAN = 1.1774
+RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 """Median length of a vector whose two components have the standard deviation 1."""
 
 

@@ -25,6 +25,7 @@ from scipy.special import chdtri, fdtrc
 
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.normal.angular import GAP, AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
@@ -226,11 +227,8 @@ def lines_eliminated(angular: AngularSystem,
 
 
 ROUNDED = 1e-12
-"""The same of an eigenvalue or a variance that is rounding alone: exact lines leave others of 1e-9
-that are told."""
-
-LEAST_NOISE_M = 1e-12
-"""Smallest noise against which sizes are weighted, m: less is rounding."""
+"""Relative size of what is rounding alone, an eigenvalue, a variance, a factor, a change: exact
+lines leave eigenvalues of 1e-9 that are told."""
 
 OVER_NOISE = 100.0
 """Ratio of the variance of the offsets to that of their noise from which they determine a

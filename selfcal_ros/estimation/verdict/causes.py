@@ -92,7 +92,7 @@ def reading_columns(made: ColumnBuilder, residuals: np.ndarray,
 SLIP = "slip"
 
 PLACES = 12
-"""Number of instants in each view at which a slip is tested."""
+"""Number of instants in each view, or of places along it, at which a slip is tried."""
 
 
 def slip_columns(made: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
