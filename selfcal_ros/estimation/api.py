@@ -4,8 +4,6 @@
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
-
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.checks.placing import check_placing
@@ -36,13 +34,10 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
-from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.model.view import View
-from selfcal_ros.units import NS_PER_S
 
 CAMERA_STEPS = 3
 """Number of fits for the camera's distortion, each with the readings corrected by the last."""
@@ -259,29 +254,3 @@ def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None
             return None, measurements
         straight = straightened(measurements, camera)
     return camera, straight
-
-
-def pure_noise(marks: int) -> Measurements:
-    """Return readings of noise in four views, to call `calibrate` with before there are others.
-
-    Parameters
-    ----------
-    marks : int
-        Marks along each side of the plate.
-    """
-    plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
-    lines, views = np.arange(plate.angular_count), []
-    for number, view in enumerate((
-            View("identity"), View("rot90", np.pi / 2), View("line", np.pi / 4, grid=False),
-            View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)))):
-        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
-        m, n = plate.m[on_field], plate.n[on_field]
-        dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
-        once, mark = np.ones(len(m), dtype=int), np.arange(len(m))
-        visits = GridVisits(mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x,
-                            offset_y, once, once)
-        views.append(ViewReadings(
-            view, m, n, dx, dy, once, k=lines, dtheta=rng.normal(0.0, 1e-6, len(lines)),
-            count_theta=np.ones(len(lines), dtype=int), used=len(m) + len(lines),
-            visits=visits if view.grid else None))
-    return Measurements("noise", plate, tuple(views))

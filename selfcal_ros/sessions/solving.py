@@ -8,17 +8,27 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, cast
 
+import numpy as np
+
 from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
-from selfcal_ros.estimation.api import Options, calibrate, calibrate_corrected, pure_noise
+from selfcal_ros.estimation.api import Options, calibrate, calibrate_corrected
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.readings import Measurements, ViewReadings, session_digest, view_digest
+from selfcal_ros.model.readings import (
+    GridVisits,
+    Measurements,
+    ViewReadings,
+    session_digest,
+    view_digest,
+)
+from selfcal_ros.model.view import View
 from selfcal_ros.outputs import write_json
 from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
@@ -30,6 +40,7 @@ from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
+from selfcal_ros.units import NS_PER_S
 
 RETRY_S = 10.0
 """Time after which a result that could not be written is written again."""
@@ -102,6 +113,32 @@ def warm_up(marks: int = 5) -> None:
     """
     keep_freed_memory()
     calibrate(pure_noise(marks))
+
+
+def pure_noise(marks: int) -> Measurements:
+    """Return readings of noise in four views, to call `calibrate` with before there are others.
+
+    Parameters
+    ----------
+    marks : int
+        Marks along each side of the plate.
+    """
+    plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
+    lines, views = np.arange(plate.angular_count), []
+    for number, view in enumerate((
+            View("identity"), View("rot90", np.pi / 2), View("line", np.pi / 4, grid=False),
+            View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)))):
+        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
+        m, n = plate.m[on_field], plate.n[on_field]
+        dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
+        once, mark = np.ones(len(m), dtype=int), np.arange(len(m))
+        visits = GridVisits(mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x,
+                            offset_y, once, once)
+        views.append(ViewReadings(
+            view, m, n, dx, dy, once, k=lines, dtheta=rng.normal(0.0, 1e-6, len(lines)),
+            count_theta=np.ones(len(lines), dtype=int), used=len(m) + len(lines),
+            visits=visits if view.grid else None))
+    return Measurements("noise", plate, tuple(views))
 
 
 @dataclass

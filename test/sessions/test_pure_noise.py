@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.api import calibrate, pure_noise
+from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.sessions.solving import pure_noise
 
 
 @pytest.mark.parametrize("marks", [5, 21])
