@@ -146,11 +146,13 @@ def _agree(result: CalibrationResult) -> bool:
 def _fits(result: CalibrationResult) -> bool:
     """Return whether nothing contradicts the wiring: no test failed, and lines turn as marks do.
 
-    An effect beyond U leaves a result unqualified, and contradicts no wiring.
+    An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
+    plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    causes = result.verdict.causes
+    found = [(cause, block_of(cause.name)) for cause in result.verdict.causes
+             if cause.name in blocks()]
     return not result.verdict.failed and not any(
-        cause.name in blocks() and block_of(cause.name).between for cause in causes)
+        block.between or abs(cause.size) > block.plausible for cause, block in found)
 
 
 def _check_turned(measurements: Measurements, options: Options, *, contradicted: bool) -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Detection
-from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.api import _fits, calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
+from selfcal_ros.model.verdict import Cause
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import gathered
 from test.support.sessions import START_NS, small_plan
@@ -67,3 +68,14 @@ def test_another_contradiction_is_not_taken_for_wrong_offsets():
         np.arange(len(readings.views[1].m)) > 12))
     spoilt = replace(readings, views=(readings.views[0], slipped, *readings.views[2:]))
     assert not calibrate(spoilt).verdict.qualified
+
+
+@pytest.mark.parametrize(("scale", "fits"), [(0.05, True), (-0.09, True), (-2.0, False)])
+def test_a_microscope_that_undoes_the_sign_speaks_against_it(scale, fits):
+    """Marks that repeat wrongly in all views made lines of the other sign fit, with a scale of -1.
+
+    The readings were refused for their lines, although these were right.
+    """
+    result = calibrate(measured())
+    cause = Cause("microscope", scale, 1e-3, "m/m", 1e-9)
+    assert _fits(replace(result, verdict=replace(result.verdict, causes=(cause,)))) is fits
