@@ -49,7 +49,12 @@ from selfcal_ros.estimation.recheck.views import (
     map_of_marks,
     solve_marks,
 )
-from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder, LineColumns
+from selfcal_ros.estimation.terms.columns import (
+    Column,
+    ColumnBuilder,
+    LineColumns,
+    TermColumns,
+)
 from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
@@ -226,9 +231,7 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     The noise of a mark in images is the calibration's, and not none: the readings have to be
     weighted.
     """
-    if not sigma > FLOOR:
-        raise InputError("readings", "they or those of the calibration have no noise against which "
-                         "to judge a change", "use measured readings")
+    _require_noise(sigma)
     variance, stop = sigma**2, _stops(measurements, problem)
     if measurements.has_images:
         variance = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
@@ -238,15 +241,7 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     of_mark = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape) * read
     of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
         (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0))
-    made = ColumnBuilder(without_noise(problem.ground, np.zeros(read.shape)))
-    for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
-        numbers = [made.add(dict(enumerate(shape.reshape(len(read), -1)))) for shape in shapes]
-        for axis, unit in AXES:
-            for number in numbers:
-                made.column(Column(name, SHARED, axis, 1.0), number, unit)
-    made.add_terms(problem.terms)
-    columns = made.done()
-
+    columns = _columns(problem, of_mark, of_stop)
     offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
     known = columns.having(lambda block: block.of_offsets) & (
         np.isfinite(offsets).all() and not declared)
@@ -260,6 +255,28 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     effects = Effects.of(source, columns.size, np.concatenate([now.real, now.imag, offsets[parts]]),
                          before=before, length=plate.length_at(marks)[kept[start:] - start])
     return PlateReadings(problem, measurements.sense, columns, effects, variance)
+
+
+def _require_noise(sigma: float) -> None:
+    """Raise InputError if the noise of a reading, m or rad, is none."""
+    if not sigma > FLOOR:
+        raise InputError("readings", "they or those of the calibration have no noise against which "
+                         "to judge a change", "use measured readings")
+
+
+def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> TermColumns:
+    """Return the columns of marks and of stops, (n, views, nx, ny), along x, then y, and of terms.
+
+    The latter for offsets as they were seen.
+    """
+    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
+    for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
+        numbers = [made.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
+        for axis, unit in AXES:
+            for number in numbers:
+                made.column(Column(name, SHARED, axis, 1.0), number, unit)
+    made.add_terms(problem.terms)
+    return made.done()
 
 
 def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
@@ -314,6 +331,8 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
     count = len(known)
     lines = lines_of(Marks(angular.turns, np.where(known, angular.weight, 0.0), (),
                            angular.harmonics, known_plate=True))
+    if lines.n_readings:
+        _require_noise(theta.sigma)
     of_plate = np.broadcast_to(np.eye(count)[:, None], (count, *angular.weight.shape))
     values = np.concatenate([of_plate, *of_terms.values[:, None]])
     size = np.append(np.ones(count), readings.columns.size[of_terms.at])

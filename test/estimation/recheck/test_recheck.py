@@ -18,9 +18,13 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
 )
 from selfcal_ros.estimation.joint import solve
+from selfcal_ros.estimation.joint.problem import noise_estimate
+from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import _misfit, predict_recheck, recheck
+from selfcal_ros.estimation.recheck.views import Effects, map_of_lines
+from selfcal_ros.estimation.terms.columns import LineColumns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset
@@ -365,3 +369,48 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
     assert not found.changed
     at_sites = recheck(after, replace(BARE, at_places=False), plate).recheck
     assert at_sites.changed and at_sites.rms > 1.5 * found.rms
+
+
+@pytest.mark.parametrize("sense", Sense)
+def test_lines_of_two_views_as_one_generalised_least_squares(sense):
+    """Some are not read; the plate is known with a dense covariance, and a term has a size."""
+    rng, count, sigma, turns = np.random.default_rng(8), 7, 2e-6, (0, 3)
+    weight = rng.integers(1, 4, (2, count)) * (rng.random((2, count)) < 0.8)
+    root, y = 3e-6 * rng.normal(size=(2 * count, count)), 1e-5 * rng.normal(size=(2, count))
+    before, of_term, plate = root @ root.T, rng.normal(size=(2, count)), 1e-5 * rng.normal(
+        size=count)
+    columns = np.concatenate([np.tile(np.eye(count)[:, None], (1, 2, 1)), of_term[None]])
+    source = np.array(["known plate"] * count + ["terms"])
+    effects = Effects.of(source, np.append(np.ones(count), 4e-6), plate, before=before,
+                         length=np.zeros(count))
+    noise = noise_estimate((sigma, 99), (np.nan, 0), np.nan)
+    found = map_of_lines(AngularSystem(turns, weight, known_plate=True), y,
+                         LineColumns(np.arange(count + 1), columns), effects, sense=sense,
+                         noise=noise)
+
+    view, line = np.nonzero(weight)
+    at = (line + np.array(turns)[view]) % count
+    if sense is Sense.PLATE_MOVES:  # H(k) = -G(-k)
+        design, at = -np.eye(count)[-at % count], -at % count
+    else:
+        design = np.eye(count)[at]
+    known, of_plate = np.isin(np.arange(count), at), np.eye(count)[line]
+    cover = np.diag(sigma**2 / weight[view, line]) + of_plate @ before[count:, count:] @ of_plate.T
+    cover += 4e-6**2 * np.outer(of_term[view, line], of_term[view, line])
+    white = np.linalg.inv(np.linalg.cholesky(cover))
+    gain = np.linalg.pinv(white @ np.hstack([design, np.eye(2)[view]]), rcond=1e-9) @ white
+    rows = gain[:count][known]
+    rows = rows - rows.mean(axis=0)
+    np.testing.assert_array_equal(found.known, known)
+    np.testing.assert_allclose(found.values, rows @ (y[view, line] - plate[line]), atol=1e-15)
+    np.testing.assert_allclose(found.covariance(0.0), rows @ cover @ rows.T, atol=1e-20)
+    np.testing.assert_allclose(found.from_plate, rows @ of_plate, atol=1e-9)
+
+
+def test_lines_without_noise_are_refused():
+    """There is nothing to judge their change by, however noisy the marks are."""
+    _, after = sessions()
+    plate = known_plate(replace(calibrated(), noise=replace(calibrated().noise, sigma_theta=1e-14)),
+                        "r.json")
+    with pytest.raises(InputError, match="no noise against which to judge a change"):
+        recheck(after, linear(), plate)
