@@ -14,7 +14,7 @@ from selfcal_ros.estimation.verdict.roughness import adequacy_of, known_places
 from selfcal_ros.model.artifact import Interpolation, MapGrid
 from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.plate_form import with_nodes
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import Sense, subset
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -122,6 +122,23 @@ def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(tur
     assert known.sum() == count
     emap = calibrate(found, LINEAR).error_map
     assert np.array_equal(emap.valid, known)
+
+
+def test_a_map_whose_middle_is_not_read_is_known_around_it():
+    """By the dense solution in their datum; u of the others is beyond the noise of 3 readings."""
+    found, _ = readings(plate(9, 7, "bilinear"), SIX, np.random.default_rng(1), linear=True)
+    views = []
+    for view in found.views:
+        at = view.view.pose.places(found.artifact, view.m, view.n) / found.artifact.grid_pitch_m
+        outside = np.maximum(np.abs(at.real), np.abs(at.imag)) > 2.5
+        views.append(subset(view, outside, np.zeros(0, dtype=bool)))
+    found = replace(found, views=tuple(views))
+    result = calibrate(found, replace(LINEAR, causes=False, at_places=False))
+    emap = result.error_map
+    field, u = dense(found, emap.valid)
+    np.testing.assert_array_equal(emap.valid, u.max(axis=0) < 3)
+    assert not emap.valid[2:5, 2:5].any() and emap.valid.sum() == 40
+    assert emap.gx[emap.valid] == pytest.approx(field[0][emap.valid], abs=1e-13)
 
 
 def test_a_result_keeps_plate_and_map_apart():

@@ -659,7 +659,7 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     digest = hashlib.blake2b(grid.weight, digest_size=16)
     digest.update(angular.weight)
     key = (grid.weight.shape, grid.poses, grid.index, grid.rotations, grid.known_plate,
-           angular.weight.shape,
+           angular.known_plate, angular.weight.shape,
            angular.poses, angular.index, angular.harmonics, digest.digest())
     with _lock:
         if key in _cache:
