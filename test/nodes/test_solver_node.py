@@ -86,10 +86,11 @@ def test_the_map_is_that_of_the_readings_bit_for_bit(solve, graph):
     assert last.max_error_um == pytest.approx(norm.max() * 1e6, rel=1e-12)
 
 
-def test_the_state_is_a_line_that_topic_echo_shows_whole(solve):
+def test_topic_echo_shows_the_figures_of_the_state_whole(solve):
     _, summaries, measurements = solve()
     assert summaries[-1].state == state_line(worded(calibrate(measurements)))
-    assert len(summaries[-1].state) <= 128
+    figures, assumed, _ = summaries[-1].state.partition("; U assumes a plate that bends by ")
+    assert assumed and len(figures) <= 128
 
 
 def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):

@@ -359,7 +359,7 @@ def state_sentence(result: CalibrationResult) -> str:
 def state_line(result: CalibrationResult) -> str:
     """Return grade, error and U in one line; its figures fit what `ros2 topic echo` shows.
 
-    It shows 128 characters. The reason of a grade below good follows.
+    It shows 128 characters. What U owes to assumptions and the reason of a grade below good follow.
     """
     figures, verdict = map_figures(result.error_map), result.verdict
     if VERIFICATION in result.extra:

@@ -426,7 +426,9 @@ def assumption_text(result: CalibrationResult) -> str:
 def _assumed(line: BudgetLine) -> str:
     name = line.component.removeprefix(TERM)
     unit = PERCENT if name == "microscope" else unit_of(name, line.unit)
-    size = f"{line.details['given'] * unit.per_si:.3g} {unit.name} (k=1)"
+    given = line.details.get("given")  # a file may have lost it
+    size_si = given if isinstance(given, float) else line.u
+    size = f"{size_si * unit.per_si:.3g} {unit.name} (k=1)"
     return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 
 
