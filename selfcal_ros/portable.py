@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Windows lacks: locks of files, opening without waiting, holding back an interrupt.
+"""Files, signals and streams as each system has them: locks, interrupts, readers that are gone.
 
-There, nothing is locked and no interrupt is held back; bags and results are worked on all the same.
+On Windows nothing is locked and no interrupt is held back; bags and results are worked on all the
+same.
 """
 
 import contextlib
 import os
 import signal
 from collections.abc import Iterator
+from typing import TextIO
 
 try:
     import fcntl  # not on Windows
@@ -52,3 +54,11 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def say_no_more(*streams: TextIO) -> None:
+    """Let everything that is still printed go nowhere, also at the end of the process."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in streams:
+        os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

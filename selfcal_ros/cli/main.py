@@ -19,7 +19,6 @@ from typing import Any, NoReturn
 
 from selfcal_ros import __version__
 from selfcal_ros.cli.arguments import add_force, check_existing, misplaced
-from selfcal_ros.cli.terminal import say_no_more
 from selfcal_ros.cli.verbs import (
     EXAMPLES,
     GROUPS,
@@ -38,7 +37,7 @@ from selfcal_ros.errors import (
     did_you_mean,
     printable,
 )
-from selfcal_ros.portable import hold_interrupts
+from selfcal_ros.portable import hold_interrupts, say_no_more
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
 NUMBERS = {"float": "a number; give it without a unit, with a decimal point",

@@ -3,7 +3,6 @@
 
 import argparse
 import contextlib
-import os
 import sys
 import threading
 import time
@@ -73,14 +72,6 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
         put(data)
     else:
         tell(text)
-
-
-def say_no_more(*streams: TextIO) -> None:
-    """Let everything that is still printed go nowhere, also at the end of the process."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in streams:
-        os.dup2(nowhere, stream.fileno())
-    os.close(nowhere)
 
 
 def tell(text: str) -> None:

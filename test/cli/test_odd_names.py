@@ -57,7 +57,9 @@ def test_no_reason_is_cut(folder, monkeypatch, capsys):
     (model,) = (each["model"] for each in cause["remedies"] if "model" in each)
     remedy = f"solve with --model {model}, or {remedy}"
     assert cause["text"] == f"{what}: {remedy}"
-    assert sentence == f"Good within an enlarged U: {cause['text']}"
+    said, _, assumed = sentence.partition("; U assumes ")
+    assert said == f"Good within an enlarged U: {cause['text']}"
+    assert assumed.startswith("a microscope known to 1 % (k=1)")
     assert main(["report", "r.json", "-o", "r.html"]) == 0
     page = html.unescape(Path("r.html").read_text())
     for cell in (what, remedy):
