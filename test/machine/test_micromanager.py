@@ -24,6 +24,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "microscope"
 @pytest.fixture
 def config(tmp_path):
     shutil.copytree(EXAMPLE, tmp_path, dirs_exist_ok=True)
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(plan.read_text().replace("grid_size: 5", "grid_size: 3"))
     return str(tmp_path / "demo.cfg")
 
 
