@@ -44,11 +44,15 @@ def hold_interrupts(*, held: bool) -> None:
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up."""
+    """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up.
+
+    One that is ignored stays so: `nohup` lets a command outlive its terminal.
+    """
     def end(number: int, _: object) -> None:
         raise SystemExit(128 + number)
     ends = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.signal(number, end) for number in ends}
+    before = {number: signal.signal(number, end) for number in ends
+              if signal.getsignal(number) is not signal.SIG_IGN}
     try:
         yield
     finally:

@@ -106,17 +106,33 @@ class LeftAlone(SimulatedMachine):
 """
 
 
+def write_left_alone(folder, name, module):
+    """Write a cell whose stage sends a signal to the command in its ninth move."""
+    write_cell(folder)
+    (folder / f"{module}.py").write_text(LEFT_ALONE.replace("SIGNAL", name))
+    cell = folder / "cell.yaml"
+    cell.write_text(cell.read_text().replace(
+        "machine: simulated\nsimulated:", f"machine: {module}:LeftAlone\nLeftAlone:"))
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_stops_the_stage_and_keeps_the_bag(tmp_path, monkeypatch, capsys, name):
     monkeypatch.chdir(tmp_path)
-    write_cell(tmp_path)
-    machine = f"left_alone_{name}"
-    Path(f"{machine}.py").write_text(LEFT_ALONE.replace("SIGNAL", name))
-    Path("cell.yaml").write_text(Path("cell.yaml").read_text().replace(
-        "machine: simulated\nsimulated:", f"machine: {machine}:LeftAlone\nLeftAlone:"))
+    write_left_alone(tmp_path, name, f"left_alone_{name}")
     with pytest.raises(SystemExit) as ended:
         main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"])
     assert ended.value.code == 128 + signal.Signals[name]
     assert "stopped; bag is kept, --resume continues" in capsys.readouterr().err
     assert Path("stopped.txt").exists()
     assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]) == 0
+
+
+def test_under_nohup_a_measurement_outlives_its_terminal(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_left_alone(tmp_path, "SIGHUP", "left_by_nohup")
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert not Path("stopped.txt").exists()
