@@ -222,8 +222,10 @@ EXACT_SIZE = 21
 N_DRAWS = 400
 """Unit-noise draws for the uncertainties of a larger plate: standard error 3.5 % each."""
 
-_JOINT = "solve with --method joint"
-_REMEDY = "measure Hu's four views in full, or solve with --method joint"
+JOINTLY = "solve with --method joint"
+"""Remedy for what the law cannot use."""
+
+_REMEDY = f"measure Hu's four views in full, or {JOINTLY}"
 _NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, lines only",
           "one pitch along +X with grid and lines")
 
@@ -318,7 +320,7 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
             artifact.angular_count % 4 or artifact.harmonics):
         raise InputError("method law", "Hu's law needs a square plate with 4, 8, 12, ... lines "
                          "and a value at each line",
-                         _JOINT)
+                         JOINTLY)
     wanted: dict[tuple, int] = {
         (0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1, (0, (1, 0), 0): 3}
     found: dict[int, ViewReadings] = {}

@@ -11,12 +11,10 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.judge import judged
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.papers.law import solve_law
+from selfcal_ros.papers.law import JOINTLY, solve_law
 
 LAW = "law"
 """Name of Hu's law among the methods."""
-
-_JOINT = "solve with --method joint"
 
 
 def calibrate_by(method: str, measurements: Measurements, options: Options) -> CalibrationResult:
@@ -65,4 +63,4 @@ def require_plain(measurements: Measurements, options: Options) -> None:
             ("method law", options.reference, "Hu's law has no reference length"),
             ("method law", options.terms, "Hu's law has no terms besides stage and plate")):
         if given:
-            raise InputError(name, why, _JOINT)
+            raise InputError(name, why, JOINTLY)
