@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic file output."""
+"""Atomic file output, and text in ASCII."""
 
 import contextlib
 import json
@@ -14,7 +14,7 @@ from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from selfcal_ros.errors import InputError, first_line
 
 TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
 """Names of unfinished files and folders, locked by their writer."""
+_ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
+          "σ": "sigma", "²": "^2", "−": "-", "∞": "inf"}
 
 
 @contextlib.contextmanager
@@ -219,3 +221,18 @@ def plain(value: Any) -> Any:
         whole = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
         return value.tolist() if whole else plain(value.tolist())
     return value
+
+
+def to_ascii(text: str) -> str:
+    """Return `text` in ASCII: known symbols spelled out, others replaced by a question mark."""
+    spelled = "".join(_ASCII.get(char, char) for char in text.replace(" °", "°"))
+    return spelled.encode("ascii", "replace").decode()
+
+
+def can_print_symbols(stream: TextIO) -> bool:
+    """Return whether the encoding of `stream` holds every symbol of a summary."""
+    try:
+        "".join(_ASCII).encode(getattr(stream, "encoding", None) or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True

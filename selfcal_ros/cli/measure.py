@@ -17,8 +17,8 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.machine.cell import connected, read_cell
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
+from selfcal_ros.outputs import can_print_symbols, to_ascii
 from selfcal_ros.portable import ended_by_signals, say_no_more
-from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
 from selfcal_ros.units import MM_PER_M, NM_PER_M
 
 

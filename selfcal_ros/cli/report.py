@@ -12,11 +12,10 @@ from selfcal_ros.cli.arguments import refuse_existing
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
-from selfcal_ros.outputs import check_outputs
+from selfcal_ros.outputs import can_print_symbols, check_outputs
 from selfcal_ros.reporting.chapters import ABOUT
 from selfcal_ros.reporting.figures.maps import map_picture
 from selfcal_ros.reporting.report import check_name, write_report
-from selfcal_ros.reporting.summary.numbers import can_print_symbols
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.results import read_result
 from selfcal_ros.standards.chapter import certificate_chapter, certified

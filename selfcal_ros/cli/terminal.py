@@ -15,8 +15,7 @@ from selfcal_ros.errors import ExitCode, printable
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.outputs import json_text
-from selfcal_ros.reporting.summary.numbers import can_print_symbols, to_ascii
+from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
 
 STDOUT = "-"
 """Name of an output file: the result goes to stdout, everything else to stderr."""

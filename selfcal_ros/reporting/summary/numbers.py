@@ -6,7 +6,6 @@ import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TextIO
 
 import numpy as np
 
@@ -17,23 +16,6 @@ from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M, 
 
 UNKNOWN = "–"
 _NUMBER = re.compile(r"(> )?[−+-]?\d[\d.]*(e[+-]?\d+)?|–|∞")
-_ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
-          "σ": "sigma", "²": "^2", "−": "-", "∞": "inf"}
-
-
-def to_ascii(text: str) -> str:
-    """Return `text` in ASCII: known symbols spelled out, others replaced by a question mark."""
-    spelled = "".join(_ASCII.get(char, char) for char in text.replace(" °", "°"))
-    return spelled.encode("ascii", "replace").decode()
-
-
-def can_print_symbols(stream: TextIO) -> bool:
-    """Return whether the encoding of `stream` holds every symbol of a summary."""
-    try:
-        "".join(_ASCII).encode(getattr(stream, "encoding", None) or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return True
 
 
 def significant(value: float, digits: int = 3) -> str:

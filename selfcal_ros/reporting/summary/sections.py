@@ -16,6 +16,7 @@ from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import VERIFICATION, CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
+from selfcal_ros.outputs import to_ascii
 from selfcal_ros.reporting.summary.numbers import (
     UNKNOWN,
     MapFigures,
@@ -31,7 +32,6 @@ from selfcal_ros.reporting.summary.numbers import (
     map_figures,
     numeric_columns,
     significant,
-    to_ascii,
     truth_figures,
     um,
 )

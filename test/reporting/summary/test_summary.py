@@ -28,16 +28,15 @@ from selfcal_ros.model.verdict import (
     TermResult,
     Verdict,
 )
+from selfcal_ros.outputs import can_print_symbols, to_ascii
 from selfcal_ros.reporting.summary.numbers import (
     aligned,
     anywhere_m,
     arcsec,
-    can_print_symbols,
     fixed_column,
     map_figures,
     significant,
     summary_numbers,
-    to_ascii,
     truth_figures,
     um,
 )
