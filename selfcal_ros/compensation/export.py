@@ -13,7 +13,8 @@ from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Grade, reference_name
+from selfcal_ros.model.verdict import reference_name
+from selfcal_ros.outputs import to_ascii
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 PLAUSIBLE, PLAUSIBLE_M = 0.01, 1e-6
@@ -145,16 +146,13 @@ def _uncertainty_line(result: CalibrationResult) -> str:
 
 
 def verdict_lines(result: CalibrationResult) -> list[str]:
-    """Return the verdict, with the reasons if not qualified."""
+    """Return the verdict with what U assumes, and its reasons unless it is good, in ASCII."""
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
-    lines = [f"measured until {when}"] if when else []
-    if verdict.grade is Grade.GOOD:
-        return [*lines, "verdict: good, the readings agree with the model"]
-    if verdict.grade is Grade.ENLARGED:
-        return [*lines, "verdict: good within an enlarged uncertainty",
-                *(f"because: {reason}" for reason in verdict.reasons)]
-    return [*lines, "verdict: NOT QUALIFIED",
-            *(f"because: {reason}" for reason in verdict.reasons)]
+    measured = [f"measured until {when}"] if when else []
+    said = verdict.sentence or verdict.grade.replace("_", " ")
+    lines = [f"verdict: {said if verdict.qualified else 'NOT QUALIFIED'}",
+             *(f"because: {reason}" for reason in verdict.reasons)]
+    return [*measured, *map(to_ascii, lines)]
 
 
 def _reference_lines(result: CalibrationResult) -> list[str]:

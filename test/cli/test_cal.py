@@ -2,6 +2,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -214,6 +215,15 @@ def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb)
     code, _, err = run(verb, "r.json", *along, "-o", "f.cal")
     assert code == 2
     one_line(err, "f.cal: ")  # it is there; nothing was handed on
+
+
+@pytest.mark.parametrize("grade", [Grade.GOOD, Grade.ENLARGED])
+def test_a_table_names_what_its_uncertainty_assumes(run, grade):
+    said = Verdict(grade, sentence="Good; U assumes a plate that bends by 0.005 µm")
+    write_json("r.json", result_to_dict(replace(result_of(MAP), verdict=said)))
+    assert run("export", "r.json", "-o", "f.cal")[0] == 0
+    text = Path("f.cal").read_bytes().decode("ascii")
+    assert "; verdict: Good; U assumes a plate that bends by 0.005 um\n" in text
 
 
 @pytest.mark.parametrize(("args", "message"), [
