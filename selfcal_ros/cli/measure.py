@@ -58,13 +58,14 @@ def run(args: argparse.Namespace) -> int:
             work.measure(resume=args.resume)
     except (MachineError, NoDataError) as error:
         desk.end()
-        kept = "; what was measured is kept, --resume continues" if bag.exists() else ""
+        kept = f"; {bag} is kept, --resume continues" if bag.exists() else ""
         kind = NoDataError if isinstance(error, NoDataError) else InputError
         raise kind(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
     except (KeyboardInterrupt, SystemExit):
         desk.end()
+        kept = f"{bag} is kept, --resume continues" if bag.exists() else "nothing was measured yet"
         with contextlib.suppress(OSError):  # of a terminal that is closed
-            print(f"selfcal measure: stopped; {bag} is kept, --resume continues", file=sys.stderr)
+            print(f"selfcal measure: stopped; {kept}", file=sys.stderr)
         raise
     desk.end()
     if plan.verify:

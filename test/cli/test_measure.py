@@ -127,6 +127,18 @@ def test_a_signal_stops_the_stage_and_keeps_the_bag(tmp_path, monkeypatch, capsy
     assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]) == 0
 
 
+def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_left_alone(tmp_path, "SIGTERM", "left_at_once")
+    module = tmp_path / "left_at_once.py"
+    module.write_text(module.read_text() + """
+    def __init__(self, *args, **kwargs):
+        raise KeyboardInterrupt
+""")
+    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 130
+    assert "stopped; nothing was measured yet" in capsys.readouterr().err
+
+
 def test_under_nohup_a_measurement_outlives_its_terminal(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_left_alone(tmp_path, "SIGHUP", "left_by_nohup")
