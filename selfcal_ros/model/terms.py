@@ -113,6 +113,11 @@ def default_terms() -> tuple[ModelTerm, ...]:
     return tuple(default_of(block) for block in blocks().values() if block.sizes)
 
 
+def block_of_offsets() -> Block:
+    """Return the block whose columns are made of the measured offsets."""
+    return next(block for block in blocks().values() if block.of_offsets)
+
+
 def microscope_term(*parts: float) -> ModelTerm:
     """Return the microscope's term from prior standard uncertainties.
 
@@ -122,7 +127,7 @@ def microscope_term(*parts: float) -> ModelTerm:
         Standard uncertainty of its scale (m/m), of its rotation relative to the axes (rad), and of
         half the difference of its scales and half its squareness error; missing ones by default.
     """
-    block = next(block for block in blocks().values() if block.of_offsets)
+    block = block_of_offsets()
     return ModelTerm(block.name, parts=(*parts, *block.sizes[len(parts):]))
 
 

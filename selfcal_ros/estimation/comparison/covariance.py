@@ -31,7 +31,6 @@ from selfcal_ros.estimation.joint.solve import (
     BESIDE,
     KEY,
     MAX_FULL,
-    OF_OFFSETS,
     OF_PLATE,
     factors_of,
     kept_numbers,
@@ -46,6 +45,7 @@ from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import View, shared_rotations
 
 COVARIANCE = "map_covariance"
@@ -384,7 +384,7 @@ class Together:
         of_stage = stage[:, :, sites].reshape(len(stage), here)
         maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
         maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
-        maps[:r, -4:] = self._kept(OF_OFFSETS, (4,)) / self.half_width_m
+        maps[:r, -4:] = self._kept(block_of_offsets().name, (4,)) / self.half_width_m
         return maps
 
     def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:

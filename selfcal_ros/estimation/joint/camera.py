@@ -350,10 +350,10 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
 
     None without images, or if they do not determine it up to its mean.
     """
-    images, nodes = model.problem.images, model.problem.ground.yaw
-    if images is None or images.yaw is None or nodes is None or model.equations is None:
+    images, ground = model.problem.images, model.problem.ground
+    name = next((term.name for term in model.problem.terms if term.block.of_images), None)
+    if images is None or name is None or model.equations is None:
         return None
-    name = next(term.name for term in model.problem.terms if term.block.of_images)
     free = replace(model.equations,
                    columns=model.equations.columns.scaled(name, math.inf))
     rows = free.rows([name]) & (free.norm > free.norm.max() * TRACE)
@@ -376,8 +376,9 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
         to_map @ fit.parameters[:3 * grid.n_views].T)[1]
     covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
     covariance *= noise.sigma**2
-    yaw, n = centred @ values[rows], len(centred) - 1
-    statistic = yaw @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw
-    place = sense.sign * nodes.nodes[seen]  # (1.6) and its rotations
-    return StageYawMap(place.real, place.imag, sense.sign * yaw, np.sqrt(np.diag(covariance)),
+    turned, n = centred @ values[rows], len(centred) - 1
+    statistic = turned @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ turned
+    x, y = (sense.sign * axis.ravel()[seen]  # (1.6) and its rotations
+            for axis in np.meshgrid(*ground.node_axes_m, indexing="ij"))
+    return StageYawMap(x, y, sense.sign * turned, np.sqrt(np.diag(covariance)),
                        float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))

@@ -4,7 +4,7 @@
 Vibration and noise of the encoders move all marks of an image together. Such noise looks like an
 error of the stage, so that residuals show only part of it. Both noises follow from two sums of
 squares of the residuals, of the readings and of the images' sums, and from what draws of either
-noise make of them, the yaw of the stage fitted to them as to the readings.
+noise make of them, with the terms that only images show fitted to them as to the readings.
 """
 
 import math
@@ -15,8 +15,10 @@ import numpy as np
 
 from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.normal.equations import Memo, NormalEquations
-from selfcal_ros.estimation.terms.visits import StageYaw
+from selfcal_ros.estimation.terms.columns import term_columns
+from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import CellsSeen, View, cells_seen
 
 IMAGES = "images"
@@ -57,8 +59,8 @@ class TwoNoises:
 
 
 @dataclass(frozen=True, eq=False)
-class FittedYaw:
-    """The yaw of the stage fitted to the residuals of grid readings.
+class FittedTerms:
+    """Terms fitted to the residuals of grid readings.
 
     Attributes
     ----------
@@ -82,10 +84,11 @@ class FittedYaw:
 
     def freed(self, residual: np.ndarray,
               parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals and misalignments of a fit without the yaw after one with it."""
+        """Return residuals and misalignments of a fit without the terms after one with them."""
         right = np.einsum("pvij,vij->p", self.residuals.conj(), self.weight * residual).real
-        yaw = self.inverse @ right
-        return residual - np.tensordot(yaw, self.residuals, 1), parameters - yaw @ self.parameters
+        values = self.inverse @ right
+        return (residual - np.tensordot(values, self.residuals, 1),
+                parameters - values @ self.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +109,11 @@ class ImageNoise:
         that of images, and of both together less these.
     parameters : float array (draws, 2, 3 views)
         Misalignments for unit noise of marks and of images, as in `JointFit`, m.
+    fitted : FittedTerms, optional
+        The terms of the draws.
     gain : float
         Variance of the map (mean over its nodes) for unit noise of images, over that for unit noise
         of marks.
-    yaw : FittedYaw, optional
-        Of the draws, if the model has it.
     """
 
     stop: np.ndarray
@@ -118,8 +121,13 @@ class ImageNoise:
     weight: np.ndarray
     drawn: np.ndarray
     parameters: np.ndarray
+    fitted: FittedTerms | None = None
     gain: float = 1.0
-    yaw: FittedYaw | None = None
+
+    @property
+    def taken(self) -> int:
+        """Degrees of freedom that these terms take."""
+        return 0 if self.fitted is None else self.fitted.rank
 
     @property
     def marks(self) -> float:
@@ -187,9 +195,9 @@ def _dof_of(draws: np.ndarray) -> float:
     return float(2 * draws.mean() ** 2 / spread) if spread else math.inf
 
 
-def image_noise(artifact: Artifact, views: Sequence[View],
-                system: NormalEquations, yaw: StageYaw | None = None) -> ImageNoise | None:
-    """Return the images behind grid readings; None without images, or for iterated fields.
+def image_noise(artifact: Artifact, views: Sequence[View], system: NormalEquations, *,
+                ground: TermInputs, terms: Sequence[ModelTerm] = ()) -> ImageNoise | None:
+    """Return the images behind grid readings; None without images.
 
     Parameters
     ----------
@@ -199,47 +207,50 @@ def image_noise(artifact: Artifact, views: Sequence[View],
         All views of the measurement; sub-views of one view have images in common.
     system : NormalEquations
         The grid readings.
-    yaw : StageYaw, optional
-        The yaw of the stage, if the model has it.
+    ground : TermInputs
+        What is made of the readings.
+    terms : sequence of ModelTerm
+        Terms of the model that only images show.
     """
     key = cells_seen(artifact, [views[index] for index in system.grid_index])
     if key is None:
         return None
-    size = None if yaw is None else (yaw.half_m, tuple(yaw.arms.tolist()))
-    return _known.get(system, (key, size), lambda: _drawn(system, key, yaw))
+    nominal = replace(ground, visits=(None,) * len(ground.names))
+    return _known.get(system, (key, tuple(term.name for term in terms)),
+                      lambda: _drawn(system, key, term_columns(nominal, terms).grid))
 
 
 _known: Memo[tuple, ImageNoise] = Memo()
 
 
-def _fitted_yaw(system: NormalEquations, yaw: StageYaw) -> FittedYaw:
+def _fitted_terms(system: NormalEquations, columns: np.ndarray) -> FittedTerms:
+    """Return what is left of columns (p, views, nx, ny)."""
     grid = system.grid
-    left = []
-    for column in yaw.columns():
-        values = np.zeros(grid.read.shape, dtype=complex)
-        for view, of_marks in column.items():
-            values[view] = of_marks.reshape(values[view].shape)
-        left.append(_solved(system, values[grid.read])[:2])
-    residuals, parameters = (np.array(part) for part in zip(*left, strict=True))
+    residuals = np.zeros(columns.shape, dtype=complex)
+    parameters = np.zeros((len(columns), 3 * grid.n_views))
+    for number, column in enumerate(columns):
+        residuals[number], parameters[number], _ = _solved(system, column[grid.read])
     flat = residuals[:, grid.read]
     gram = (flat.conj() @ (grid.weight[grid.read] * flat).T).real
-    norm = np.abs(flat).max()
+    norm = np.abs(flat).max(initial=0.0)
     values, vectors = np.linalg.eigh(gram)
     determined = values > GAP * norm**2 * len(flat.T)
     inverse = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
-    return FittedYaw(grid.weight, residuals, parameters, inverse, int(determined.sum()))
+    return FittedTerms(grid.weight, residuals, parameters, inverse, int(determined.sum()))
 
 
-def _drawn(system: NormalEquations, views: CellsSeen,
-           yaw: StageYaw | None) -> ImageNoise:
-    """Return images and draws of readings; `views` are the names in the plan and steps of cells."""
+def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> ImageNoise:
+    """Return images and draws of readings, with columns (p, views, nx, ny) fitted to them.
+
+    `views` are the names in the plan and steps of cells.
+    """
     grid = system.grid
     stops = stops_of(views, grid.read)
     weight = grid.weight[grid.read]
     drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
-    fitted = None if yaw is None else _fitted_yaw(system, yaw)
+    fitted = _fitted_terms(system, columns)
     plain = ImageNoise(stops, grid.read, weight, drawn,
-                       np.zeros((len(drawn), 2, 3 * len(views))), yaw=fitted)
+                       np.zeros((len(drawn), 2, 3 * len(views))), fitted)
     power = np.zeros(2)
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):
@@ -247,8 +258,7 @@ def _drawn(system: NormalEquations, views: CellsSeen,
             len(stops), stops.max() + 1))
         solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
         power += [one[2] for one in solved]
-        left, parameters[:] = zip(*(
-            one[:2] if fitted is None else fitted.freed(*one[:2]) for one in solved), strict=True)
+        left, parameters[:] = zip(*(fitted.freed(*one[:2]) for one in solved), strict=True)
         row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
         row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
     return replace(plain, gain=float(power[1] / power[0]))

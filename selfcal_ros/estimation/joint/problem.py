@@ -318,14 +318,11 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     grid = problem.system.grid
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    alone = found = sigma_of(total, grid_dof(problem))
+    found = problem.residuals_xy or sigma_of(total, grid_dof(problem))
     repeats = problem.repeats_xy
-    if problem.residuals_xy is not None:
-        found = problem.residuals_xy
-        if problem.images is not None and problem.images.yaw is not None:
-            alone = sigma_of(total, grid_dof(problem) - problem.images.yaw.rank)
     if problem.images is not None and total > 0:  # of which residuals show only part
-        noises = problem.images.noises(residual)
+        taken = problem.images.taken if problem.residuals_xy else 0
+        alone, noises = sigma_of(total, grid_dof(problem) - taken), problem.images.noises(residual)
         found = found[0] * noises.sigma / alone[0], min(noises.dof, found[1])
         repeats = repeats[0], repeats[1] / noises.excess(problem.images.marks)
     return noise_estimate(repeats, found, problem.grid.sigma_declared, floor=FLOOR)

@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import (
     InputError,
     NoDataError,
@@ -77,6 +76,7 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
+from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan, cells_seen
 from selfcal_ros.units import NS_PER_S
@@ -216,9 +216,6 @@ unit noise, (2, nx, ny)."""
 
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 """Coefficients of a microscope in their order."""
-
-OF_OFFSETS = "microscope"
-"""Key of what factors make of them."""
 
 ANGULAR_KEY = "angular_terms"
 """Key of each term's contribution to the standard uncertainty of the angular map, rad."""
@@ -455,9 +452,8 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
             visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations)
         if ground.has(term.name))
     images = image_noise(
-        measurements.artifact, [v.view for v in measurements.views], system,
-        ground.yaw if any(term.block.of_images for term in terms) else None,
-    ) if measurements.has_images else None
+        measurements.artifact, [v.view for v in measurements.views], system, ground=ground,
+        terms=[term for term in terms if term.block.of_images])
     return problem_of(measurements, options, system, ground, readings=(grid, angular),
                       terms=terms, images=images), seen
 
@@ -638,12 +634,13 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
         of_plate = of_plate + stage[system.known_lines].mean(axis=0)
         stage = lines_turned_over(sense, stage)
         lines = np.stack([stage, of_plate]).transpose(2, 0, 1) * length
-    of_offsets = -length * np.array([[
-        block_of(column.term).of_offsets and column.component == part
+    of_offsets = block_of_offsets()
+    measured = -length * np.array([[
+        column.term == of_offsets.name and column.component == part
         for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)
     return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
                 len(plates), 2, *system.grid.views.plate_shape),
-            "lines": lines, OF_OFFSETS: of_offsets}
+            "lines": lines, of_offsets.name: measured}
 
 
 def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:

@@ -21,7 +21,7 @@ from selfcal_ros.estimation.terms.equations import (
     TermEquations,
     equations_of_columns,
 )
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, stage_yaw, view_time
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 from selfcal_ros.model.view import (
@@ -110,7 +110,7 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
                   placing_names=tuple(view.plan_view for view in grid_views),
-                  yaw=stage_yaw(artifact, grid_views),
+                  cells_m=np.array([view.cell_m for view in grid_views]), stage=artifact.field,
                   drift_degree=assumed.drift_degree,
                   poses=tuple(view.pose for view in grid_views))
 

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of the term columns: visits of each grid view, their approach, poses of the plate, yaw.
+"""Inputs of the term columns: visits of each grid view, their approach, poses of the plate.
 
 For the map, the mean over the visits of a mark is as good as the visits themselves. The scatter of
 the visits of one mark about their mean determines terms that differ between them, and the noise.
-
-The yaw of the stage has a coefficient at each node of a grid over the field, with bilinear
-interpolation between them: a mark at d from the optical axis is read at d - i yaw d (eq. 4.17).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +19,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import Pose
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE
-from selfcal_ros.model.view import View, placings_of
+from selfcal_ros.model.view import placings_of
 
 FARTHEST_M = 1e6
 """Largest valid deviation or offset of a visit."""
@@ -209,72 +206,6 @@ MOST_VALUES = 16_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class StageYaw:
-    """Nodes of the yaw, and how marks in the cells of images depend on it.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Number of nodes along x and y.
-    half_m : tuple of float
-        Half the sides of the field that they cover, m.
-    arms : complex array (views,)
-        Place of the cell of each view in the image, stage axes, m.
-    places : complex array (views, marks)
-        Where the stage stands for each mark of each view, in the sense of (1.6), m.
-    phases : complex array (views,)
-        From the stage frame to the plate frame.
-    """
-
-    shape: tuple[int, int]
-    half_m: tuple[float, float]
-    arms: np.ndarray
-    places: np.ndarray
-    phases: np.ndarray
-
-    @property
-    def nodes(self) -> np.ndarray:
-        """Places of the nodes, in the sense of (1.6), complex (nodes,), m."""
-        x, y = (np.linspace(-half, half, n) for half, n in zip(
-            self.half_m, self.shape, strict=True))
-        return (x[:, None] + 1j * y).ravel()
-
-    def columns(self, phases: Sequence[complex] | None = None,
-                beside: np.ndarray | None = None) -> Iterator[dict[int, np.ndarray]]:
-        """Yield the readings of all marks for a yaw of 1 rad at each node, by view, plate frame.
-
-        `phases` replace those of the nominal poses; `beside`, (views, marks), is where the marks
-        are beside the places of their cells, stage axes, m: a constant yaw, a turn of the camera,
-        does not act on it.
-        """
-        nx, ny = self.shape
-        x, y = (np.clip((part / half + 1) / 2, 0, 1) * (n - 1) for part, half, n in zip(
-            (self.places.real, self.places.imag), self.half_m, self.shape, strict=True))
-        unit = -1j * (self.phases if phases is None else np.array(phases))[:, None]
-        turned = unit * (self.arms[:, None] + (0 if beside is None else beside))
-        constant = unit * (0 if beside is None else beside) / (nx * ny)
-        seen = np.flatnonzero(turned.any(axis=1))
-        for i in range(nx):
-            along = np.maximum(1 - np.abs(x - i), 0)
-            for j in range(ny):
-                weight = along * np.maximum(1 - np.abs(y - j), 0)
-                yield {view: turned[view] * weight[view] - constant[view] for view in seen.tolist()}
-
-
-def stage_yaw(artifact: Artifact, views: Sequence[View]) -> StageYaw | None:
-    """Return the yaw behind the grid views of a measurement; None without images."""
-    arms = np.array([view.cell_m for view in views])
-    if not arms.any():
-        return None
-    sites = artifact.field.shape
-    most = int(np.sqrt(MOST_VALUES / (len(views) * artifact.m.size)))
-    nx, ny = (min(n, max(most, 2), MOST_NODES) for n in sites)
-    return StageYaw((nx, ny), artifact.field_half_m, arms, np.stack([
-        view.pose.places(artifact, artifact.m, artifact.n).ravel() for view in views]),
-        np.array([view.pose.phase for view in views]).conj())
-
-
-@dataclass(frozen=True, eq=False)
 class TermInputs:
     """Inputs of the term columns.
 
@@ -304,8 +235,10 @@ class TermInputs:
         see one plate, bent and drifting alike. Empty: each view is a placing.
     placing_names : tuple of str
         Names of the placings of the views.
-    yaw : StageYaw, optional
-        How images depend on the yaw of the stage; None without images.
+    cells_m : complex array (views,)
+        Place of the cell of each view in its image, stage axes; 0 without images.
+    stage : Artifact, optional
+        Its sites, or the nodes of the map.
     drift_degree : int
         Degree of the polynomial of a view's time that a block may have.
     poses : tuple of Pose
@@ -324,9 +257,19 @@ class TermInputs:
     with_lines: tuple[int, ...] = ()
     placings: tuple[int, ...] = ()
     placing_names: tuple[str, ...] = ()
-    yaw: StageYaw | None = None
+    cells_m: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    stage: Artifact | None = None
     drift_degree: int = DRIFT_DEGREE
     poses: tuple[Pose, ...] = ()
+
+    @property
+    def node_axes_m(self) -> list[np.ndarray]:
+        """Places along x and y of nodes of a term over the field, in the sense of (1.6), m."""
+        if self.stage is None:
+            return []
+        most = max(2, int(np.sqrt(MOST_VALUES / (len(self.names) * self.z.size))))
+        return [np.linspace(-half, half, min(sites, most, MOST_NODES)) for half, sites in zip(
+            self.stage.field_half_m, self.stage.shape, strict=True)]
 
     def on_stage(self, view: int) -> np.ndarray:
         """Return the nominal places of all marks in a view, stage axes, complex (marks,), m."""
@@ -381,7 +324,7 @@ class TermInputs:
         """Return whether any reading can depend on a term."""
         block = block_of(term)
         if block.of_images:
-            return self.yaw is not None
+            return bool(self.cells_m.any())
         return not block.of_lines or bool(self.with_lines if block.between else self.line_names)
 
     def name_of(self, term: str, view: int) -> str:
@@ -407,7 +350,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
-                      stage_yaw(measurements.artifact, views) if measurements.has_images else None,
+                      np.array([view.cell_m for view in views]), measurements.artifact.field,
                       drift_degree, tuple(view.pose for view in views))
 
 

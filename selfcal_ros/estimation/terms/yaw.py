@@ -6,6 +6,7 @@ the optical axis is read at d - i yaw d (eq. 4.17).
 """
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,30 @@ from selfcal_ros.model.terms import ModelTerm
 
 
 def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
-    """Yield the yaw at each node: the same at all visits of a mark."""
-    if inputs.yaw is None:
+    """Yield the yaw at each node: the same at all visits of a mark; nothing without images."""
+    if not inputs.cells_m.any():
         return
-    phases = [nominal if view is None else view.phase
-              for view, nominal in zip(inputs.visits, inputs.yaw.phases, strict=True)]
-    here = inputs.weight.reshape(len(phases), -1) > 0
-    for node, means in enumerate(inputs.yaw.columns(phases, _beside_cells(inputs))):
-        yield Pattern(((f"node {node}", 1),),
-                      {view: values * here[view] for view, values in means.items()})
+    views = range(len(inputs.names))
+    places = np.array([inputs.on_stage(view) for view in views])
+    along = [_hats(part, axis) for part, axis in zip(
+        (places.real, places.imag), inputs.node_axes_m, strict=True)]
+    phases = np.array([inputs.poses[view].phase.conjugate() if visits is None else visits.phase
+                       for view, visits in enumerate(inputs.visits)])
+    unit = -1j * phases[:, None] * (inputs.weight.reshape(places.shape) > 0)
+    beside = unit * _beside_cells(inputs)
+    turned = unit * inputs.cells_m[:, None] + beside
+    seen = [view for view in views if turned[view].any()]
+    nodes = list(product(*along))
+    for number, (of_x, of_y) in enumerate(nodes):
+        # a constant yaw is a turn of the camera: it does not act beside the cells
+        values = turned * of_x * of_y - beside / len(nodes)
+        yield Pattern(((f"node {number}", 1),), {view: values[view] for view in seen})
+
+
+def _hats(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the weight of each node at places along an axis, m; linear between two of them."""
+    at = np.interp(places, nodes, np.arange(len(nodes)))
+    return np.array([np.maximum(1 - np.abs(at - node), 0) for node in range(len(nodes))])
 
 
 def _beside_cells(inputs: TermInputs) -> np.ndarray:
@@ -40,7 +56,7 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
             out[row, visits.mark] = visits.means(visits.offset[None], inputs.z.size)[
                 0, visits.mark]
     for members in inputs.members.values():
-        axis = [row for row in members if inputs.yaw is not None and not inputs.yaw.arms[row]]
+        axis = [row for row in members if not inputs.cells_m[row]]
         out[members] += np.where(out[members], (mean[axis[0]] if axis else 0) - mean[
             members, None], 0)
     return out

@@ -17,6 +17,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.equations import system_for
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
@@ -145,7 +146,9 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
 def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
     measurements, matrix, stops, inverse = whole(missing)
     system = system_for(grid_data(measurements), angular_data(measurements))
-    images = image_noise(measurements.artifact, [v.view for v in measurements.views], system)
+    grid = grid_data(measurements)
+    images = image_noise(measurements.artifact, [v.view for v in measurements.views], system,
+                         ground=ground_of(measurements, grid, 1.0))
     left = np.eye(len(matrix)) - matrix @ inverse
     together = np.kron(stops[:, None] == stops, np.eye(2))
     expected = [[np.trace(left), np.trace(left @ together @ left)],
