@@ -155,6 +155,11 @@ class BagLines(NamedTuple):
     clock: list[str]
     refused: dict[str, int]
 
+    @property
+    def faults(self) -> list[str]:
+        """All lines."""
+        return [*self.lost, *self.clock]
+
 
 def bag_lines(path: str | Path, settings: CollectorSettings,
               namespace: str | None = None) -> BagLines:

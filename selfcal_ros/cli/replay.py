@@ -6,6 +6,7 @@ import contextlib
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -87,14 +88,13 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.bag, args.params], [file_of(args)])
     source, detector = bag_input(args.bag), detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
+    bag = bag_lines(args.bag, settings, args.namespace)
+    for line in bag.faults:  # first: what the nodes say of the readings follows from them
+        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
     with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
           domain(args.domain) as environment):
         saved = folder / "result.json"
-        code, unplayed = _play(args, saved, environment, detector)
-        bag = bag_lines(args.bag, settings, args.namespace)
-        for line in (*bag.lost, *bag.clock):
-            if line not in unplayed:
-                print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+        code, unplayed = _play(args, saved, environment, detector, said=bag.faults)
         if saved.exists():
             data = with_bag(read_json(saved), bag, unplayed, source)
             if file_of(args):
@@ -195,7 +195,7 @@ def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str],
     source : dict
         File and SHA-256 of the bag.
     """
-    beside = [line for line in unplayed if line not in (*bag.lost, *bag.clock)]
+    beside = [line for line in unplayed if line not in bag.faults]
     known = [*bag.lost, *beside, *bag.clock]
     of_nodes = [line for line in data["warnings"] if line not in known]
     refused = dict(sorted((data["rejected"] | bag.refused).items()))
@@ -204,7 +204,11 @@ def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str],
 
 
 def _play(args: argparse.Namespace, saved: Path, environment: dict,
-          detector: DetectorSettings | None) -> tuple[int, list[str]]:
+          detector: DetectorSettings | None, *, said: Sequence[str]) -> tuple[int, list[str]]:
+    """Return the exit code of the session, and what it could not play, a line each.
+
+    Lines that are `said` are not printed again.
+    """
     rest = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate
@@ -233,5 +237,6 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict,
                 bar(int(done), int(total))
             elif word == "lost":
                 lost.append(tail)
-                print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
+                if tail not in said:
+                    print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
         return session.wait(), lost
