@@ -34,6 +34,7 @@ from selfcal_ros.cli.terminal import (
     put,
     show,
 )
+from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError
@@ -105,6 +106,9 @@ def run(args: argparse.Namespace) -> int:
         if code or not saved.exists():  # perhaps a result without a map
             return code or 1
     result = result_from_dict(data, args.bag)
+    used = sum(view.used for view in result.views)
+    for line in rejections(result.rejected, used) if not result.warnings else ():
+        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)

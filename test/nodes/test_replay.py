@@ -251,6 +251,22 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_pat
     assert capsys.readouterr().err == "what the nodes say\n"
 
 
+def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, capsys):
+    bag = small_bag(tmp_path, small_plan(repeats=4), not_finite=0.2)
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")]) == 0
+    said = capsys.readouterr().err
+    assert "detections were rejected" in said and "not_finite" in said
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        if module.endswith("replay_session"):
+            write_json(given[3], read_json(tmp_path / "solved.json"))
+        yield SimpleNamespace(stdout=[], wait=lambda: 0)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 0
+    assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
+
+
 def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypatch, tmp_path):
     """They are not played: here a detection that is stamped a day late."""
     bag = stepped_bag(tmp_path, 0.0)
