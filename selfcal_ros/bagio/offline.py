@@ -53,8 +53,8 @@ class BagSession(NamedTuple):
     lost : list of str
         Unreadable parts, and clock steps, one line each.
     findings : list of str
-        Clock steps, and why most detections of the bag, or of views, were rejected, one
-        line each.
+        Clock steps, lost commands, and why most detections of the bag, or of views, were
+        rejected, one line each.
     """
 
     measurements: Measurements
@@ -112,6 +112,7 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
     findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
                 for index, finding in collector.findings(measurements, views).items()]
+    findings = [*collector.missing_commands(), *findings]
     if not any(view.used for view in measurements.views):
         reasons = ", ".join(f"{reason} {count}" for reason, count in
                             sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])

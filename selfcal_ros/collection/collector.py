@@ -240,6 +240,20 @@ class Collector:
         return self._seen.findings({index: view.readings for index, view in progress.items()},
                                    measurements.rejected)
 
+    def missing_commands(self) -> list[str]:
+        """Return which commands of the run were lost, as far as that is seen, one line each."""
+        timeline, stamps = self.timeline, self._views.table["stamp"]
+        lines = [f"no command of view {index} of the plan (from 0) is there: what was measured in "
+                 f"it counts in no view, or in another; receive and record {COMMAND_TOPIC} whole"
+                 for index in timeline.absent]
+        for name, after in timeline.unmeasured.values():
+            count = int(((stamps >= after.start_ns) & (stamps < after.end_ns)).sum())
+            if count:
+                lines.append(f"view '{name}' was placed, and {count} detections followed, but its "
+                             "MEASURE command is missing: they count in no view; measure the view "
+                             f"again, and receive and record {COMMAND_TOPIC} whole")
+        return lines
+
     def finding_of_last(self, progress: Mapping[int, ViewProgress], index: int,
                         rejected: Mapping[str, int]) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""

@@ -76,6 +76,9 @@ class Timeline:
         Result whose correction is on, from the last MEASURE.
     strays : tuple of Command
         Ignored commands, see `without_strays`.
+    unmeasured : dict
+        view_index -> name of a view that was placed without a MEASURE, and the time from then to
+        the next command.
     """
 
     plan_id: str = ""
@@ -90,6 +93,13 @@ class Timeline:
     strays: tuple[Command, ...] = ()
     artifact_from: str = ""
     verify: str = ""
+    unmeasured: dict[int, tuple[str, Interval]] = field(default_factory=dict)
+
+    @property
+    def absent(self) -> list[int]:
+        """Views before the last measured one of which there is no command."""
+        return [index for index in range(max(self.views, default=0))
+                if index not in self.views and index not in self.unmeasured]
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -177,11 +187,14 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
                              f"the rest of plan '{plan_id}'", "use one plate in one plan")
         views[command.view_index] = view
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
-    return Timeline(plan_id, artifact, dict(sorted(views.items())),
-                    tuple(_intervals(ordered, runs, run_id)), planned,
+    intervals = tuple(_intervals(ordered, runs, run_id))
+    unmeasured = {c.view_index: (c.placed().name, interval)
+                  for c, run, interval in zip(ordered, runs, intervals, strict=True)
+                  if run == run_id and c.phase == Phase.PLACE and c.view_index not in views}
+    return Timeline(plan_id, artifact, dict(sorted(views.items())), intervals, planned,
                     ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns,
                     run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms, strays,
-                    newest.artifact_from, newest.verify)
+                    newest.artifact_from, newest.verify, unmeasured)
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
