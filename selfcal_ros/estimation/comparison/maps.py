@@ -144,7 +144,7 @@ def significance(values: np.ndarray, spread: Spread) -> Significance | None:
         return None
     ratio, varies, rank = values / spread.u, spread.varies, spread.rank
     square = float(spread.squares(np.where(varies, ratio, 0.0)))
-    p = float(fdtrc(rank, dof, square / rank) if dof <= MANY_DOF else chdtrc(rank, square))
+    p = of_square(square, rank, dof)
     largest = float(abs(ratio[varies]).max())
     drawn = abs(spread.drawn[varies]).max(axis=0) if spread.correlated else None
     p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
@@ -153,6 +153,14 @@ def significance(values: np.ndarray, spread: Spread) -> Significance | None:
                         min(p, p_z) < USUAL_LEVEL / 2,
                         u_rms=float(np.sqrt(spread.variance.mean())),
                         u_largest=float(np.sqrt(of_largest)))
+
+
+def of_square(square: float, rank: float, dof: float) -> float:
+    """Return the probability of a sum of squares of `rank` values of unit variance.
+
+    `dof` are the degrees of freedom of the noise behind that variance.
+    """
+    return float(fdtrc(rank, dof, square / rank) if dof <= MANY_DOF else chdtrc(rank, square))
 
 
 def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:

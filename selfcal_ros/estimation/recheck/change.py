@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, i0e, stdtr
+from scipy.special import stdtr
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
@@ -22,6 +22,7 @@ from selfcal_ros.estimation.comparison.maps import (
     USUAL_LEVEL,
     Spread,
     joint_dof,
+    of_square,
     significance,
 )
 from selfcal_ros.estimation.normal.angular import GAP
@@ -39,12 +40,6 @@ from selfcal_ros.model.recheck import (
     Significance,
 )
 from selfcal_ros.model.result import CalibrationResult
-
-FEW, LARGE = 3.0, 3.0
-"""Number of changed nodes, and their change in standard uncertainties, of the second statistic."""
-
-TAIL = 0.005
-"""Probability below which draws are too few, and a bound of it counts if that is smaller."""
 
 ORDER = 2
 """Degree of the polynomials of the third statistic."""
@@ -81,23 +76,14 @@ class ChangeTests(Spread):
         factor = np.linalg.cholesky(self._smooth.T @ self.remaining @ self._smooth)
         return np.linalg.solve(factor, self._smooth.T)
 
-    def of(self, values: np.ndarray) -> np.ndarray:
-        """Return the three statistics of changes (2n, draws), (3, draws)."""
-        every, smooth = ((white**2).sum(axis=0) for white in self._white(values))
-        return np.stack([every, self._of_few(values), smooth])
+    def seen(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return changes (2n, draws) as the three statistics see them, with unit variance.
 
-    def _white(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the squares of the first and third statistic are of, (..., draws)."""
-        return self.white(values / self.u[:, None]), self._whiten_smooth @ values
-
-    def _of_few(self, values: np.ndarray) -> np.ndarray:
-        """Return the second statistic of changes (2n, draws), (draws,)."""
-        few = np.hypot(*(values / self.u[:, None]).reshape(
-            2, len(self.places), values.shape[1]))
-        part = FEW / len(few)
-        likelier = np.logaddexp(np.log1p(-min(part, 0.5)), np.log(part) + LARGE * few
-                                - LARGE**2 / 2 + np.log(i0e(LARGE * few)))
-        return likelier.sum(axis=0)
+        Along their axes (rank, draws), at the nodes (2, n, draws), as polynomials (k, draws).
+        """
+        ratio = values / self.u[:, None]
+        at_nodes = ratio.reshape(2, len(self.places), -1)
+        return self.white(ratio), at_nodes, self._whiten_smooth @ values
 
     @cached_property
     def _noise(self) -> np.ndarray:
@@ -107,27 +93,28 @@ class ChangeTests(Spread):
     @cached_property
     def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics of noise, each in order, (3, DRAWS), and the least rank from above, sorted."""
-        statistics = self.of(self._noise)
-        ranks = DRAWS - np.argsort(np.argsort(statistics, axis=1), axis=1)
-        return np.sort(statistics, axis=1), np.sort(ranks.min(axis=0))
+        drawn = statistics(self.seen(self._noise))
+        ranks = DRAWS - np.argsort(np.argsort(drawn, axis=1), axis=1)
+        return np.sort(drawn, axis=1), np.sort(ranks.min(axis=0))
 
     def p(self, values: np.ndarray) -> float:
-        """Return the probability of as significant a change, (2n,), if there is none."""
-        statistics, (drawn, least) = self.of(values[:, None])[:, 0], self._ranked
-        rank = min(DRAWS - int(np.searchsorted(row, statistic)) + 1
-                   for row, statistic in zip(drawn, statistics, strict=True))
-        p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
-        return float(p) if p > TAIL else min(float(p), self._bound(values, statistics))
+        """Return the probability of as significant a change, (2n,), if there is none.
 
-    def _bound(self, values: np.ndarray, statistics: np.ndarray) -> float:
-        """Return a bound of the probability, close where it is small (Bonferroni)."""
-        dof, n = min(self.dof, MANY_DOF), len(self.u)
-        each = [2 * n * float(stdtr(dof, -np.abs(values / self.u).max()))]
-        for square, free in ((statistics[0], self.rank),
-                             (statistics[2], self._smooth.shape[1])):
-            each.append(float(fdtrc(free, dof, square / free) if self.dof <= MANY_DOF
-                              else chdtrc(free, square)))
-        return min(3 * min(each), 1.0)
+        A change beyond all draws has the bound, which is close there, if that is smaller.
+        """
+        found, (drawn, least) = statistics(self.seen(values[:, None]))[:, 0], self._ranked
+        rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
+                   for row, one in zip(drawn, found, strict=True))
+        p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
+        return p if rank > 1 else min(p, self._bound(values, found))
+
+    def _bound(self, values: np.ndarray, found: np.ndarray) -> float:
+        """Return a bound of the probability (Bonferroni)."""
+        each = [float(2 * len(self.u) * stdtr(min(self.dof, MANY_DOF),
+                                              -np.abs(values / self.u).max())),
+                of_square(found[0], self.rank, self.dof),
+                of_square(found[2], self._smooth.shape[1], self.dof)]
+        return min(len(each) * min(each), 1.0)
 
     def detectable(self, level: float) -> Detectable:
         """Return the changes of which POWER are found if the tests have a level.
@@ -148,22 +135,25 @@ class ChangeTests(Spread):
                             for shape in (one, smooth)))
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
-        """Return the size of a change of given shape of which POWER are found, by bisection.
-
-        Two of the statistics are squares, in which the size is that of a parabola.
-        """
+        """Return the size of a change of given shape of which POWER are found, by bisection."""
         low, high = 0.0, 20 * rms(self.u)
-        curves = [((one**2).sum(axis=0) - limit, 2 * (one * other).sum(axis=0),
-                   (other**2).sum(axis=0)) for one, other, limit in zip(
-            self._white(noise), self._white(shape), limits[[0, 2]], strict=True)]
+        unchanged, unit = self.seen(noise), self.seen(shape)
         for _ in range(10):
             size = (low + high) / 2
-            found = np.any([c + size * (b + size * a) >= 0 for c, b, a in curves], axis=0)
-            left = ~found
-            found[left] = self._of_few(noise[:, left] + size * shape[:, left]) >= limits[1]
-            enough = found.mean() >= POWER
-            low, high = (low, size) if enough else (size, high)
+            changed = tuple(one + size * other for one, other in zip(unchanged, unit, strict=True))
+            found = (statistics(changed) >= limits).any(axis=0)
+            low, high = (low, size) if found.mean() >= POWER else (size, high)
         return high
+
+
+def statistics(seen: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return the three statistics of changes as `ChangeTests.seen` returns them, (3, draws).
+
+    Sums of squares; at the nodes of sixth powers, between a sum that all nodes share alike and the
+    largest alone.
+    """
+    every, at_nodes, smooth = ((part**2).sum(axis=0) for part in seen)
+    return np.stack([every, (at_nodes**3).sum(axis=0), smooth])
 
 
 @dataclass(frozen=True, eq=False)

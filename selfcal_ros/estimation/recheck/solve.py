@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
-from selfcal_ros.estimation.comparison.maps import joint_dof
+from selfcal_ros.estimation.comparison.maps import joint_dof, of_square
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -59,7 +58,7 @@ from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import MANY_DOF, ErrorMap, ThetaDatum, datum_modes, rms
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
@@ -350,7 +349,7 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
     """
     if dof <= 0:
         return ()
-    p = float(chdtrc(dof, square) if dof_noise >= MANY_DOF else fdtrc(dof, dof_noise, square / dof))
+    p = of_square(square, dof, dof_noise)
     ratio = float(np.sqrt(square / dof))
     if not (p < F_LEVEL and ratio > SAME):
         return ()
