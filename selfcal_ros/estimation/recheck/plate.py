@@ -231,26 +231,11 @@ def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarr
 MANY = 5.0
 """Median difference, in standard uncertainties, beyond which most marks differ."""
 
-ALIKE = 0.3
-"""Correlation of neighbours below which differences are of marks, not of a stage."""
-
-BY_CHANCE = 3.5
-"""Part of differences that neighbours may by chance not share, over the root of their number."""
-
-BY_CHANCE_BETTER = 8.0
-"""Gain of the log-likelihood that one of all poses may have by chance, over the same root."""
-
 LEAST = 0.01
 """Part of the known errors of the marks by which those of another plate differ at least."""
 
 STEPS = 6
 """Steps to the motion of a view by least absolute values."""
-
-NEIGHBOURS = 1.3
-"""Largest distance of neighbouring marks, in pitches."""
-
-DISTANCES = ((0.7, 1.2), (1.2, 1.7), (1.7, 2.2))
-"""Distances at which differences are compared, in pitches."""
 
 PLANNED = (1 + 0j, 0j)
 """No further turn, no further shift."""
@@ -351,7 +336,8 @@ def _other_pose(seen: _Read, plate: np.ndarray,
                 artifact: Artifact) -> tuple[complex, complex] | None:
     """Return the pose that explains the readings much better than the planned one; else None.
 
-    By the gain of the log-likelihood of differences of unknown size.
+    By the gain of the log-likelihood of differences of unknown size. Poses that do not explain most
+    of them count as not tried: some gain by chance.
     """
     tried = []
     for pose in motions(artifact, seen.turn, seen.shift):
@@ -359,11 +345,11 @@ def _other_pose(seen: _Read, plate: np.ndarray,
         if here is None or planned is None:
             continue
         before, after = (max(_size(rest), seen.u) for rest, _ in (planned, here))
-        tried.append((2 * len(here[0]) * float(np.log(before / after)), pose))
+        if before**2 > CONTRADICTED * after**2:
+            tried.append((2 * len(here[0]) * float(np.log(before / after)), pose))
     tried.sort(key=lambda item: -item[0])
     second = tried[1][0] if len(tried) > 1 else 0.0
-    least = max(BETTER, BY_CHANCE_BETTER * np.sqrt(len(seen.marks)))
-    if not tried or tried[0][0] < least or tried[0][0] - second < CLEARLY:
+    if not tried or tried[0][0] < BETTER or tried[0][0] - second < CLEARLY:
         return None
     return tried[0][1]
 
@@ -384,32 +370,24 @@ def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -
 
 
 def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
-    """Return whether what is left is of the marks, not of a stage alone, which changes smoothly."""
-    own, least = _not_shared(marks, rest), BY_CHANCE / np.sqrt(len(marks))
-    return _neighbours(marks, rest) < ALIKE or own > max(MANY * u, least * _size(rest))
+    """Return whether what is left is of the marks: a stage alone changes continuously.
 
-
-def _neighbours(marks: np.ndarray, rest: np.ndarray) -> float:
-    """Return the correlation of what is left at neighbouring marks."""
-    away = np.abs(marks[:, None] - marks)
-    first, other = np.nonzero((away > 0) & (away < NEIGHBOURS))
-    products = (rest[first] * rest[other].conj()).real
-    return float(products.mean() / np.mean(np.abs(rest)**2)) if len(products) else 1.0
-
-
-def _not_shared(marks: np.ndarray, rest: np.ndarray) -> float:
-    """Return the standard deviation, of a component, of what no neighbour shares; 0 if unknown.
-
-    Half the mean squares of differences at 1, 1.4 and 2 pitches, continued to no distance by a
-    parabola in its square. Single marks that are far off count as far off as others.
+    Both are normal: of the stage with a correlation that falls with the distance, exponentially, of
+    the marks each by itself. That the part of the marks is more than `MANY` u must be likelier than
+    that it is not. Sizes and lengths are tried by halves and doubles, with the best scale.
+    Single marks that are far off count as far off as others.
     """
-    size = np.maximum(np.abs(rest) / (BEYOND * _size(rest)), 1.0)
-    away, rest, means = np.abs(marks[:, None] - marks), rest / size, []
-    for nearest, farthest in DISTANCES:
-        first, other = np.nonzero((away > nearest) & (away < farthest))
-        if len(first) < len(marks):
-            return 0.0
-        square = np.mean(away[first, other] ** 2)
-        means.append((1.0, square, square**2, np.mean(np.abs(rest[first] - rest[other])**2) / 4))
-    of = np.array(means)
-    return float(np.sqrt(max(np.linalg.solve(of[:, :3], of[:, 3])[0], 0.0)))
+    away = np.abs(marks[:, None] - marks)
+    rest = rest / np.maximum(np.abs(rest) / (BEYOND * _size(rest)), 1.0)
+    best = {True: -math.inf, False: -math.inf}
+    length = 1.0
+    while length < 2 * away.max():
+        alike, axes = np.linalg.eigh(np.exp(-away / length))
+        power = np.abs(axes.T @ rest) ** 2
+        for own in 2.0 ** np.arange(-20, 20):
+            variance = np.mean(power / (alike + own)) / 2
+            likelihood = -len(rest) * np.log(variance) - np.log(alike + own).sum()
+            differs = bool(np.sqrt(own * variance) > MANY * u)
+            best[differs] = max(best[differs], float(likelihood))
+        length *= 2
+    return best[True] > best[False]

@@ -99,15 +99,15 @@ def test_another_machine_with_another_plate_is_not_a_changed_stage(seed):
     assert [found.name for found in result.verdict.failed] == ["other_plate"]
 
 
-def test_what_neighbours_do_not_share_is_found_beneath_a_smooth_field():
-    """A parabola has none of it; a unit of each mark by itself is found to its scatter."""
+def test_what_neighbours_do_not_share_is_found_beneath_a_continuous_field():
+    """A bend and a step are of a stage, as much of each mark by itself is not."""
     half, rng = np.arange(-7.0, 8.0), np.random.default_rng(1)
     z = (half[:, None] + 1j * half).ravel()
-    smooth = 0.05 * (z.real**2 + 1j * z.real * z.imag)
     white = rng.normal(size=len(z)) + 1j * rng.normal(size=len(z))
-    assert of_plate._not_shared(z, smooth) < 0.1
-    assert of_plate._not_shared(z, smooth + white) == pytest.approx(1.0, abs=0.25)
-    assert of_plate._not_shared(z[::30], white[::30]) == 0.0
+    for field in (0.05 * (z.real**2 + 1j * z.real * z.imag), 2.0 * (z.real > 2)):
+        assert not of_plate._of_marks(z, field + 0.02 * white, 0.1)
+        assert of_plate._of_marks(z, field + white, 0.1)
+    assert of_plate._of_marks(z, white, 0.1) and not of_plate._of_marks(z, white, 1.0)
 
 
 @pytest.mark.parametrize("size", [5e-7, 1e-5])
