@@ -36,6 +36,16 @@ def test_what_disagrees_with_its_lengths_is_no_chunk(told):
     assert next_record(data, 0, None) == len(data)
 
 
+@pytest.mark.parametrize(("behind", "channels", "is_one"), [
+    (b"", {3}, True), (b"\x05", {3}, True), (b"\x0f", {3}, True),  # whole to the last byte
+    (b"\x00", {3}, False), (b"", {4}, False)])
+def test_a_message_without_a_chunk_is_known_by_its_channel_and_by_what_follows(
+        behind, channels, is_one):
+    message = b"\x05" + struct.pack("<QHIQQ", 22, 3, 1, 10, 20)
+    data = b"?" * 11 + message + behind
+    assert next_record(data, 0, channels) == (11 if is_one else len(data))
+
+
 @pytest.mark.parametrize("missing", range(1, 26))
 def test_the_front_of_a_chunk_at_the_end_of_the_file_is_none(missing):
     """Its length counts what is there, so that only the lengths inside it are cut off."""

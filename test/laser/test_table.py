@@ -54,6 +54,12 @@ def test_blocks_may_be_numbered_from_zero(tmp_path):
     assert data.n_blocks == 2
 
 
+def test_a_table_that_lacks_a_body_diagonal_is_one_of_three_axes_still(tmp_path):
+    names = ",".join(f"r{axis}_{name}" for name in DIAGONALS[3][:3] for axis in "xyz")
+    (tmp_path / "d.csv").write_text(f"block,{names}\n1,{','.join('5' * 9)}\n")
+    assert dimension_of(tmp_path / "d.csv") == 3
+
+
 @pytest.mark.parametrize("steps", [(0.01, 0.01), (0.01, 0.02, 0.005)])
 def test_writing_and_reading_gives_the_same_measurement(tmp_path, steps):
     rng = np.random.default_rng(2)

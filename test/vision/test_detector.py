@@ -160,6 +160,7 @@ def test_a_good_mark_has_no_fault():
     ("broken", disc(drawn(), 66, 55, 4, 0.75)),  # a piece is missing
     ("reflection", disc(drawn(), 60, 55, 4, 0.99)),
     ("reflection", disc(drawn(), 70, 50, 4, 0.99)),
+    ("reflection", disc(drawn(), 80, 50, 1, 0.99)),  # at the rim of the window
     ("saturated", drawn(ground=1.2, contrast=0.9)),
     ("weak", drawn(ground=0.5, contrast=0.08, shot_noise=0.1))])
 def test_a_bad_mark_is_rejected_with_its_reason(reason, values):

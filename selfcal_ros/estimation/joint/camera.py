@@ -29,9 +29,6 @@ POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
 cubic ones look like linear ones in three cells."""
 
-MOST_U = 5.0
-"""Largest uncertainty of the offset in a cell of a view, over their median; others are too few."""
-
 IN_LINE = 3e-3
 """Least part of a polynomial that places must show, of that of its largest part."""
 
@@ -156,9 +153,7 @@ def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
 
     noises = images.noises(model.found.residuals)
     drawn = offsets(images.parameters)
-    spread = np.std(noises.mark * drawn[:, 0] + noises.image * drawn[:, 1], axis=0)
-    seen = (grid.read.sum(axis=(1, 2)) > 1) & (spread <= MOST_U * np.median(spread))
-    layout = _layout([one.view for one in readings], image, seen)
+    layout = _layout([one.view for one in readings], image, grid.read.sum(axis=(1, 2)) > 1)
     if layout is None:
         return None
     cells, rows, errors = layout
