@@ -288,7 +288,7 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     rng = np.random.default_rng(top["seed"])
     machine = _machine(top["machine"], f"{where}: machine", rng)
     setups = checked_fields(top["setups"], f"{where}: setups", {},
-                            {name: (dict, None) for name in DIAGONALS[machine.dim]})
+                            dict.fromkeys(DIAGONALS[machine.dim], (dict, None)))
     lengths = ("distance_nm", "reading_nm", "linear_nm")
     noise = checked_fields(top["noise"], f"{where}: noise", {},
                            {"repeats": (int, 1), **dict.fromkeys(lengths, (float, 0.0))})
