@@ -66,7 +66,7 @@ def canonical(detections: np.ndarray) -> np.ndarray:
     for field, used in (("ox", grid), ("oy", grid), ("ot", angular)):
         d[field] = np.where(used, d[field] + 0.0, 0.0)
     for field, used in (("m", grid), ("n", grid), ("k", angular)):
-        d[field] = np.where(used & d["has_id"], d[field], 0)
+        d[field] *= used & d["has_id"]
     for field in ("sigma", "score"):
         d[field] += 0.0
     return d

@@ -63,8 +63,11 @@ def structured(model: ModelFit, cover: MapsCovariance,
     if contrast := axis_contrast(model):  # of noise along x in place of y, of unit size
         turn = model.problem.to_stage[:, None, None] ** 2
         weight = model.problem.system.grid.weight
-        added = contrast * added_variances(cover, lambda rest: np.einsum(
-            "vij,kvij->k", weight, (turn * rest**2).real), rows)
+
+        def along_x(rest: np.ndarray) -> np.ndarray:
+            return np.einsum("vij,kvij->k", weight, (turn * rest**2).real)
+
+        added = contrast * added_variances(cover, along_x, rows)
     if len(correlation := time_correlation(model)):
         added = added + correlated_variances(model, cover, correlation, rows)
     return added + image_variances(model, cover, rows)

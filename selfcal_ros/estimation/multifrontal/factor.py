@@ -106,7 +106,8 @@ def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
     size = len(free) + len(keys)
     diagonal = np.bincount(variable.ravel(), (weight * (1 - relative_weight)).ravel(),
                            minlength=size)
-    diagonal[place[pins[~is_cut[pins]]]] += mean
+    pinned = place[pins[~is_cut[pins]]]
+    diagonal[pinned] += mean
     entries = _entries(variable, diagonal, weight.reshape(read.shape),
                        relative_weight.reshape(read.shape))
     cut_pins = np.zeros(len(cut))
