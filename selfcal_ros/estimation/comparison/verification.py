@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.comparison.maps import (
     Spread,
@@ -36,23 +37,12 @@ from selfcal_ros.model.result import CalibrationResult
 AXES = {"xy": ("x", "y"), "theta": ("theta",)}
 """Axes of each map."""
 
-EXPLAINED = 0.1
-"""Part of the square of the larger of map and correction that a fault leaves unexplained."""
+NEAR = 0.1
+"""Part that does not count: of a factor, by which a table may change between two calibrations, and
+of the square of the larger of map and correction, which a fault may leave unexplained."""
 
-CLEARLY_LESS = 0.3
-"""Part of what the map itself leaves unexplained, that an exchanged or mirrored map leaves."""
-
-NEAR, NEAR_ZERO = 0.1, 0.05
-"""Distances of a factor from 1 or -1, and from 0, that are not told from them."""
-
-VAGUE = 0.3
-"""Standard uncertainty of a factor beyond which nothing is said of its axis."""
-
-CHANGED = 0.5
-"""Distance of the factors of x and y from 1 that a change of the stage may cause."""
-
-ALIKE = 0.7
-"""Correlation from which on another map counts as an older one of the same stage."""
+SHARED = 0.5
+"""Part of an older table of the same stage that is in the map, of its size or of its square."""
 
 
 class Fault(StrEnum):
@@ -262,7 +252,7 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
     fault = _fault(maps, first, factors)
     if not remains and gain > 2 * u_gain:
         fault = Fault.NONE
-    elif fault is Fault.OTHER and (gain > 2 * u_gain or alike > ALIKE):
+    elif fault is Fault.OTHER and (gain > 2 * u_gain or alike * abs(alike) > SHARED):
         fault = Fault.OLDER
     axes = _axes(maps, (before, after), factors)
 
@@ -375,9 +365,9 @@ def _fault(maps: _Maps, emap: ErrorMap, factors: list[tuple[float, float]]) -> F
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
                 others[fault] = _unexplained(maps, moved @ weights)
     likely = min(others, key=lambda name: others[name], default=Fault.OTHER)
-    if others.get(likely, np.inf) < min(EXPLAINED, CLEARLY_LESS * itself):
-        return likely
-    return _of_factors(factors) if itself < EXPLAINED else Fault.OTHER
+    if itself < NEAR:
+        return _of_factors(factors)
+    return likely if others.get(likely, np.inf) < NEAR else Fault.OTHER
 
 
 def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[Fault, tuple[np.ndarray, np.ndarray]]:
@@ -391,12 +381,11 @@ def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[Fault, tuple[np.ndarray, n
 
 
 def _kind(factor: float, u: float) -> Fault | None:
-    """Return what a factor says: None if it says nothing."""
-    if not u < VAGUE * max(1.0, abs(factor)):
+    """Return what a factor says: None if it does not tell a correction from none."""
+    if BEYOND * u >= max(1.0, abs(factor)):
         return None
-    for value, near, kind in ((1.0, NEAR, Fault.NONE), (-1.0, NEAR, Fault.SIGN),
-                              (0.0, NEAR_ZERO, Fault.OFF)):
-        if abs(factor - value) <= max(near, 2 * u):
+    for value, kind in ((1.0, Fault.NONE), (-1.0, Fault.SIGN), (0.0, Fault.OFF)):
+        if abs(factor - value) <= max(NEAR * abs(value), BEYOND * u):
             return kind
     return Fault.FACTOR
 
@@ -411,15 +400,15 @@ def _of_factors(factors: list[tuple[float, float]]) -> Fault:
     shown = [(value, u) for value, u in factors if _kind(value, u)]
     values, u = np.transpose(shown)
     apart = float(values.max() - values.min())
-    if apart <= max(NEAR * abs(values).max(), 3 * float(np.linalg.norm(u))):
+    if apart <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
         return Fault.FACTOR
-    return Fault.OLDER if abs(values - 1).max() < CHANGED else Fault.AXES_DIFFER
+    return Fault.OLDER if abs(values - 1).max() < SHARED else Fault.AXES_DIFFER
 
 
 def _theta_fault(maps: _Maps, factors: list[tuple[float, float]]) -> Fault:
     """Return what acts on the angle; NONE if too little is to be seen."""
     if maps.too_small:
         return Fault.NONE
-    if _unexplained(maps, maps.before * factors[0][0]) >= EXPLAINED:
+    if _unexplained(maps, maps.before * factors[0][0]) >= NEAR:
         return Fault.OTHER
     return _kind(*factors[0]) or Fault.NONE
