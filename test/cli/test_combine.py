@@ -117,9 +117,9 @@ def test_a_map_of_the_opposite_sign_is_refused_as_such(files, tmp_path, capsys, 
 
 
 def test_maps_within_their_u_have_no_sign(files, tmp_path):
-    """Errors of 4 u at 25 nodes, and their negative: 5 u are needed to be sure."""
+    """Errors of 2 u at 25 nodes, and their negative: 3 u are needed to be sure."""
     given = read_json("1.json")["error_map"]
-    for factor, code in ((4.0, 0), (6.0, 2)):
+    for factor, code in ((2.0, 0), (4.0, 2)):
         u = {name: (np.sqrt(np.mean(np.square(np.array(given[name], float)))) / factor)
              for name in ("gx", "gy")}
         rows = [f"{(i - 2) * 0.01},{(j - 2) * 0.01},{-given['gx'][i][j]},{-given['gy'][i][j]},"

@@ -12,11 +12,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import fdtrc
 
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.checks.wiring import BEYOND, SHOWN
 from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariance
 from selfcal_ros.estimation.comparison.maps import (
     KINDS,
@@ -65,12 +67,6 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 
-FEWEST = 7
-"""Values that are needed to be sure of a sign."""
-SURE = 5.0
-"""Errors over their u, rms, from which the sign of a map is beyond doubt."""
-MIRRORED = -0.8
-"""Correlation of two maps below which the negative of one agrees with the other."""
 SAME = 1e-3
 """Difference of two maps, rms over u, below which they are of the same readings: two recordings
 repeat each other no better than their noise."""
@@ -127,11 +123,14 @@ def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray]
 def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
     """Return whether two maps, over their u, are each other's negative beyond doubt.
 
-    The ratio of their likelihoods with one sign and the other is exp(2 one . other).
+    Both are beyond noise, of more values than agree in sign by chance, and their sum is as much
+    less than their difference.
     """
-    if len(one) < FEWEST or min(rms(one), rms(other)) < SURE:
+    sizes = rms(one), rms(other)
+    if min(sizes) < BEYOND or 0.5 ** len(one) > SHOWN:
         return False
-    return bool(one @ other < MIRRORED * len(one) * rms(one) * rms(other))
+    one, other = one / sizes[0], other / sizes[1]
+    return BEYOND * rms(one + other) < rms(one - other)
 
 
 def shared_reference(results: Sequence[CalibrationResult | None],
@@ -276,16 +275,15 @@ class Mean:
 
 def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal columns of `removed`, and of what `shapes` add to them, (d, r), (d, m)."""
-    q = np.linalg.qr(removed)[0] if removed.size else removed
-    found: list[np.ndarray] = []
+    known = np.linalg.qr(removed)[0] if removed.size else removed
+    datum = known.shape[1]
     for shape in shapes.T:
         rest = shape / max(np.linalg.norm(shape), TINY)
         for _ in range(2):  # the second time removes rounding
-            for basis in (q, *(column[:, None] for column in found)):
-                rest = rest - basis @ (basis.T @ rest)
+            rest = rest - known @ (known.T @ rest)
         if np.linalg.norm(rest) > TRACE:
-            found.append(rest / np.linalg.norm(rest))
-    return q, np.stack(found, axis=1) if found else np.zeros((len(removed), 0))
+            known = np.column_stack([known, rest / np.linalg.norm(rest)])
+    return known[:, :datum], known[:, datum:]
 
 
 def _independent_number(covariance: np.ndarray) -> float:
@@ -310,11 +308,7 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
     high = float(((squares - squares.mean(axis=0)) ** 2).sum(axis=0).mean())
     if not high > 0 or excess(0.0) <= 0:
         return 0.0
-    low = 0.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return high
+    return float(brentq(excess, 0.0, high, xtol=TINY))
 
 
 def _scatter(squares: np.ndarray, within: np.ndarray) -> float:

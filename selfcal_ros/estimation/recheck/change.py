@@ -27,7 +27,7 @@ from selfcal_ros.estimation.comparison.maps import (
 )
 from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.recheck.plate import KnownPlate, rows_at
-from selfcal_ros.estimation.recheck.views import NewMap
+from selfcal_ros.estimation.recheck.views import NOISE, TERMS, NewMap
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import MANY_DOF, datum_modes, rms
 from selfcal_ros.model.recheck import (
@@ -249,11 +249,12 @@ def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray, old: np.ndarr
     """
     here, rows = common[new.known], rows[common]
     by_calibration, longer = -np.hstack([rows, new.from_plate[here]]), new.from_length[here]
-    of_new = new.of_noise[np.ix_(here, here)]
+    of_new = new.covariances(0.0)
+    of_noise = (of_new[NOISE] + of_new[TERMS])[np.ix_(here, here)]
     of_old = by_calibration @ new.effects.before @ by_calibration.T
     of_old += plate.variance_of_expansion * np.outer(longer, longer)
-    return (new.values[here] - rows @ old, of_new + of_old,
-            joint_dof((np.trace(of_new), new.dof), (np.trace(of_old), dof)))
+    return (new.values[here] - rows @ old, of_noise + of_old,
+            joint_dof((np.trace(of_noise), new.dof), (np.trace(of_old), dof)))
 
 
 def line_change(new: NewMap, plate: KnownPlate) -> Change:

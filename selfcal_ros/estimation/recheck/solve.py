@@ -109,9 +109,19 @@ class Rechecked:
         return self.new.without(datum_modes(self.artifact, scale=True).reshape(4, -1).T)
 
     @cached_property
+    def covariances(self) -> dict[str, np.ndarray]:
+        """Covariances of this map by their sources, (q, q) each, m^2."""
+        return self.in_datum.covariances(self.plate.variance_of_length)
+
+    @cached_property
     def variances(self) -> dict[str, np.ndarray]:
         """Variances of this map by their sources, (q,) each, m^2."""
-        return self.in_datum.variances(self.plate.variance_of_length)
+        return {name: np.maximum(cover.diagonal(), 0.0) for name, cover in self.covariances.items()}
+
+    @property
+    def of_lines(self) -> np.ndarray:
+        """Covariance of the angular map, rad^2."""
+        return np.sum(list(self.lines.covariances(0.0).values()), axis=0)
 
     def error_map(self) -> ErrorMap:
         """Return the map with its uncertainty."""
@@ -119,7 +129,7 @@ class Rechecked:
         variance = np.sum(list(self.variances.values()), axis=0)
         (gx, gy), (u_x, u_y) = (xy.whole(part).reshape(2, *artifact.shape)
                                 for part in (xy.values, np.sqrt(variance)))
-        u_theta = np.sqrt(np.diag(self.lines.covariance(0.0)))
+        u_theta = np.sqrt(np.diag(self.of_lines))
         theta, u_theta = (self.lines.whole(part) for part in (self.lines.values, u_theta))
         o, r = first_order(artifact, gx + 1j * gy)
         return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN)
@@ -161,8 +171,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     """
     solved = recheck_of(measurements, options, plate)
     readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
-    covers = {"xy": solved.in_datum.covariance(plate.variance_of_length),
-              "theta": solved.lines.covariance(0.0)}
+    covers = {"xy": np.sum(list(solved.covariances.values()), axis=0), "theta": solved.of_lines}
     change = map_change(solved.new, solved.artifact, plate)
     found = recheck_found(change, line_change(solved.lines, plate), solved.artifact, plate,
                           passes=min(view.view.repeats for view in measurements.views))

@@ -123,13 +123,6 @@ class NewMap:
         """What a relative expansion of the plate of 1 makes of the map, (q,)."""
         return self.from_plate @ self.effects.length
 
-    @cached_property
-    def of_noise(self) -> np.ndarray:
-        """Covariance of the map due to noise and terms, (q, q)."""
-        rest = self.effects.source != PLATE
-        part = self.moved[:, rest]
-        return self.white + part @ self.effects.covariance[np.ix_(rest, rest)] @ part.T
-
     def without(self, modes: np.ndarray) -> "NewMap":
         """Return the map without its least-squares parts in modes, (n, d)."""
         basis = np.linalg.qr(modes[self.known])[0]
@@ -138,22 +131,19 @@ class NewMap:
         return replace(self, values=values, moved=moved,
                        white=white - (white @ basis) @ basis.T)
 
-    def variances(self, variance_of_length: float) -> dict[str, np.ndarray]:
-        """Return the variances of the map by their sources, (q,) each.
+    def covariances(self, variance_of_length: float) -> dict[str, np.ndarray]:
+        """Return the covariances of the map by their sources, which add up, (q, q) each.
 
         `variance_of_length` is that of the plate's length beyond what the calibration has of it.
         """
-        out = {NOISE: self.white.diagonal(), TEMPERATURE: variance_of_length * self.from_length**2}
+        out = {}
         for source in (NOISE, PLATE, TERMS):
             here = self.effects.source == source
-            part, cover = self.moved[:, here], self.effects.covariance[np.ix_(here, here)]
-            out[source] = out.get(source, 0.0) + np.einsum("ij,ij->i", part @ cover, part)
-        return {name: np.maximum(out[name], 0.0) for name in (NOISE, PLATE, TEMPERATURE, TERMS)}
-
-    def covariance(self, variance_of_length: float) -> np.ndarray:
-        """Return the covariance of the map, (q, q); argument as of `variances`."""
-        return (self.white + self.moved @ self.effects.covariance @ self.moved.T
-                + variance_of_length * np.outer(self.from_length, self.from_length))
+            part = self.moved[:, here]
+            out[source] = part @ self.effects.covariance[np.ix_(here, here)] @ part.T
+        out[NOISE] = out[NOISE] + self.white
+        out[TEMPERATURE] = variance_of_length * np.outer(self.from_length, self.from_length)
+        return out
 
     def whole(self, values: np.ndarray) -> np.ndarray:
         """Return values (q,) at their places in the whole map, (n,), NaN elsewhere."""
