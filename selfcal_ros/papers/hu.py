@@ -154,7 +154,7 @@ def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> 
 
 def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
     options = Options(datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear",
-                      uncertainty=False)
+                      uncertainty=False, causes=False)
     return [calibrate(readings, options).error_map for readings in draws]
 
 

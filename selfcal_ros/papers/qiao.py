@@ -158,7 +158,7 @@ def _all_errors_um(truth: Truth, draws: list[Measurements]) -> list[np.ndarray]:
 
 
 def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
-    options = Options(misalignment_model="linear", uncertainty=False)
+    options = Options(misalignment_model="linear", uncertainty=False, causes=False)
     found = calibrate(readings, options).error_map
     return (np.stack([found.gx, found.gy]) - truth.g) * UM_PER_M
 
