@@ -403,7 +403,8 @@ def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     rows = rows - rows.mean(axis=0)
     np.testing.assert_array_equal(found.known, known)
     np.testing.assert_allclose(found.values, rows @ (y[view, line] - plate[line]), atol=1e-15)
-    np.testing.assert_allclose(found.covariance(0.0), rows @ cover @ rows.T, atol=1e-20)
+    whole = sum(found.covariances(0.0).values())
+    np.testing.assert_allclose(whole, rows @ cover @ rows.T, atol=1e-20)
     np.testing.assert_allclose(found.from_plate, rows @ of_plate, atol=1e-9)
 
 
