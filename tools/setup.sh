@@ -41,8 +41,8 @@ replaced() {  # the pins of tools/requirements.txt, those of $pins in place of t
     "$pins" tools/requirements.txt
 }
 
-compile() {  # what is no Python 3, as templates, is passed over
-  "$venv/bin/python" -m compileall -q -j 0 -x '/(tests?|templates?)/' "$@" || true
+compile() {  # what is no Python 3, as templates, and what nothing imports is passed over
+  "$venv/bin/python" -m compileall -q -j 0 -x '/(tests?|templates?|mypyc?|docutils)/' "$@" || true
 }
 
 wheels=$(digest tools/requirements.txt "$pins" tools/mend_wheels.py)
