@@ -11,6 +11,7 @@ difference is that of both maps, whatever acts.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -179,16 +180,78 @@ class _Maps:
         """The error before as a column of each axis, (n, axes)."""
         return self.free(_columns(self.by_axis(self.before)))
 
-    @property
+    @cached_property
     def remaining(self) -> Significance | None:
         """Test of the error with the correction on, with the covariance of both maps."""
         return significance(self.after, Spread(self.cover, self.datum, self.dof))
+
+    @property
+    def remains(self) -> bool:
+        """Whether an error remains beyond the uncertainties."""
+        test = self.remaining
+        return test is not None and min(test.p, test.p_z) < CAUSE_LEVEL
+
+    @property
+    def alike(self) -> float:
+        """Correlation of the correction that acts and the map; 0 without one of them."""
+        size = float(np.linalg.norm(self.action) * np.linalg.norm(self.before))
+        return float(self.action @ self.before) / size if size else 0.0
 
     @property
     def too_small(self) -> bool:
         """Whether the error before is not larger than its noise."""
         power = _square(self.before) - variances(self.cover_before).sum()
         return power <= 2 * (2 * _square(self.cover_before)) ** 0.5
+
+    @cached_property
+    def gain(self) -> tuple[float, float]:
+        """By how much the sum of squares falls, noise taken off, and its u."""
+        gain, variance = 0.0, 0.0
+        for sign, values, cover in ((1, self.before, self.cover_before),
+                                    (-1, self.after, self.cover_after)):
+            gain += sign * (_square(values) - float(variances(cover).sum()))
+            variance += 4 * float(variances_of(cover, values[:, None])[0]) + 2 * _square(cover)
+        return gain, variance**0.5
+
+    @property
+    def better(self) -> bool:
+        """Whether the error is less with the correction on, beyond the uncertainty of both."""
+        gain, u = self.gain
+        return gain > 2 * u
+
+    @property
+    def worse(self) -> bool:
+        """Whether it is larger."""
+        gain, u = self.gain
+        return gain < -2 * u
+
+    @cached_property
+    def factors(self) -> list[tuple[float, float]]:
+        """Factors of the correction in each axis, and their u; NaN where not shown.
+
+        What the map has of noise is in the correction as well: that part of the sum of products is
+        taken off.
+        """
+        columns, noise = self.columns, self.by_axis(variances(self.cover_before)).sum(axis=1)
+        products = columns.T @ columns
+        if np.linalg.matrix_rank(products) < len(products):
+            return [(float("nan"), float("nan"))] * len(products)
+        weights = np.linalg.solve(products, columns.T).T
+        values = np.linalg.solve(products, columns.T @ self.action - noise)
+        u = np.sqrt(variances_of(self.cover, weights))
+        return list(zip(values.tolist(), u.tolist(), strict=True))
+
+    def unexplained(self, explained: np.ndarray) -> float:
+        """Return the part of the squares that is unexplained, noise taken off."""
+        size = max(_square(self.action), _square(self.before))
+        left = _square(self.action - explained) - float(variances(self.cover).sum())
+        return max(left, 0.0) / size if size else 0.0
+
+    @property
+    def explained(self) -> bool:
+        """Whether the map with its factors is the correction that acts."""
+        factors = np.nan_to_num([value for value, _ in self.factors])
+        return self.unexplained(self.columns @ factors) < NEAR
 
 
 def require_correctable(result: CalibrationResult, where: str) -> None:
@@ -243,35 +306,27 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
         raise InputError(names[0] if np.isfinite(second.u_gx[known]).all() else names[1],
                          "has no uncertainty, so nothing can be verified",
                          "solve it again with --uncertainty always")
-    remaining = maps.remaining
-    remains = _is_clear(remaining)
-    size = float(np.linalg.norm(maps.action) * np.linalg.norm(maps.before))
-    alike = float(maps.action @ maps.before) / size if size else 0.0
-    gain, u_gain = _gain(maps)
-    factors = _straight_factors(maps)
-    fault = _fault(maps, first, factors)
-    if not remains and gain > 2 * u_gain:
+    fault = _fault(maps, first)
+    if maps.better and not maps.remains:
         fault = Fault.NONE
-    elif fault is Fault.OTHER and (gain > 2 * u_gain or alike * abs(alike) > SHARED):
+    elif fault is Fault.OTHER and (maps.better or maps.alike * abs(maps.alike) > SHARED):
         fault = Fault.OLDER
-    axes = _axes(maps, (before, after), factors)
+    axes = _axes(maps, (before, after))
 
-    theta_fault, worse = Fault.NONE, False
+    better, theta_fault = maps.better, Fault.NONE
     lines = np.isfinite(first.g_theta + second.g_theta)
     g_theta = np.full(lines.shape, np.nan)
     if lines.sum() > 2:
         circle = _maps(before, after, "theta", lines)
-        theta_gain, u_theta_gain = _gain(circle)
-        worse = theta_gain < -2 * u_theta_gain
-        factors = _straight_factors(circle)
-        if _is_clear(circle.remaining):
-            theta_fault = _theta_fault(circle, factors)
+        better = better and not circle.worse
+        if circle.remains:
+            theta_fault = _theta_fault(circle)
         g_theta[lines] = circle.after
-        axes |= _axes(circle, (before, after), factors)
+        axes |= _axes(circle, (before, after))
     gx, gy = np.full((2, *known.shape), np.nan)
     gx[known], gy[known] = maps.by_axis(maps.after)
-    return Verification(gain > 2 * u_gain and not worse, fault, theta_fault, remains, axes, alike,
-                        remaining, gx, gy, g_theta)
+    return Verification(better, fault, theta_fault, maps.remains, axes, maps.alike,
+                        maps.remaining, gx, gy, g_theta)
 
 
 def _maps(before: CalibrationResult, after: CalibrationResult, kind: str,
@@ -290,8 +345,8 @@ def _maps(before: CalibrationResult, after: CalibrationResult, kind: str,
     return _Maps(kind, known, free[0], free[1], covers[0], covers[1], datum, dof)
 
 
-def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult],
-          factors: list[tuple[float, float]]) -> dict[str, AxisError]:
+def _axes(maps: _Maps,
+          pair: tuple[CalibrationResult, CalibrationResult]) -> dict[str, AxisError]:
     """Return the errors of each axis before and after, with U and the factor."""
     u_before, u_after = (
         getattr(result.noise, f"k_{maps.kind}") * result.error_map.of(maps.kind)[1]
@@ -300,27 +355,12 @@ def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult],
     return {name: AxisError(
         rms(before[axis]), rms(after[axis]), float(np.abs(before[axis]).max()),
         float(np.abs(after[axis]).max()), rms(u_before[axis, maps.known]),
-        rms(u_after[axis, maps.known]), *factors[axis])
+        rms(u_after[axis, maps.known]), *maps.factors[axis])
         for axis, name in enumerate(AXES[maps.kind])}
-
-
-def _is_clear(test: Significance | None) -> bool:
-    """Return whether an error remains beyond the uncertainties."""
-    return test is not None and min(test.p, test.p_z) < CAUSE_LEVEL
 
 
 def _square(values: np.ndarray) -> float:
     return float((values**2).sum())
-
-
-def _gain(maps: _Maps) -> tuple[float, float]:
-    """Return by how much the sum of squares falls, noise taken off, and its u."""
-    gain, variance = 0.0, 0.0
-    for sign, values, cover in ((1, maps.before, maps.cover_before),
-                                (-1, maps.after, maps.cover_after)):
-        gain += sign * (_square(values) - float(variances(cover).sum()))
-        variance += 4 * float(variances_of(cover, values[:, None])[0]) + 2 * _square(cover)
-    return gain, variance ** 0.5
 
 
 def _columns(field: np.ndarray) -> np.ndarray:
@@ -328,34 +368,12 @@ def _columns(field: np.ndarray) -> np.ndarray:
     return block_diag(*field[:, :, None])
 
 
-def _straight_factors(maps: _Maps) -> list[tuple[float, float]]:
-    """Return the factors of the correction in each axis, and their u; NaN where not shown.
-
-    What the map has of noise is in the correction as well: that part of the sum of products is
-    taken off.
-    """
-    columns, noise = maps.columns, maps.by_axis(variances(maps.cover_before)).sum(axis=1)
-    products = columns.T @ columns
-    if np.linalg.matrix_rank(products) < len(products):
-        return [(float("nan"), float("nan"))] * len(products)
-    weights = np.linalg.solve(products, columns.T).T
-    values = np.linalg.solve(products, columns.T @ maps.action - noise)
-    u = np.sqrt(variances_of(maps.cover, weights))
-    return list(zip(values.tolist(), u.tolist(), strict=True))
-
-
-def _unexplained(maps: _Maps, explained: np.ndarray) -> float:
-    """Return the part of the squares that is unexplained, noise taken off."""
-    size = max(_square(maps.action), _square(maps.before))
-    left = _square(maps.action - explained) - float(variances(maps.cover).sum())
-    return max(left, 0.0) / size if size else 0.0
-
-
-def _fault(maps: _Maps, emap: ErrorMap, factors: list[tuple[float, float]]) -> Fault:
+def _fault(maps: _Maps, emap: ErrorMap) -> Fault:
     """Return what acts on x and y instead of the map."""
     if maps.too_small:
         return Fault.TOO_SMALL
-    itself = _unexplained(maps, maps.columns @ np.nan_to_num([value for value, _ in factors]))
+    if maps.explained:
+        return _of_factors(maps.factors)
     others = {}
     for fault, field_of in _arranged(emap.gx, emap.gy).items():
         here = np.stack(field_of)[:, maps.known]
@@ -363,10 +381,8 @@ def _fault(maps: _Maps, emap: ErrorMap, factors: list[tuple[float, float]]) -> F
             moved = maps.free(_columns(here))
             weights = np.linalg.lstsq(moved, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
-                others[fault] = _unexplained(maps, moved @ weights)
+                others[fault] = maps.unexplained(moved @ weights)
     likely = min(others, key=lambda name: others[name], default=Fault.OTHER)
-    if itself < NEAR:
-        return _of_factors(factors)
     return likely if others.get(likely, np.inf) < NEAR else Fault.OTHER
 
 
@@ -405,10 +421,10 @@ def _of_factors(factors: list[tuple[float, float]]) -> Fault:
     return Fault.OLDER if abs(values - 1).max() < SHARED else Fault.AXES_DIFFER
 
 
-def _theta_fault(maps: _Maps, factors: list[tuple[float, float]]) -> Fault:
+def _theta_fault(maps: _Maps) -> Fault:
     """Return what acts on the angle; NONE if too little is to be seen."""
     if maps.too_small:
         return Fault.NONE
-    if _unexplained(maps, maps.before * factors[0][0]) >= NEAR:
+    if not maps.explained:
         return Fault.OTHER
-    return _kind(*factors[0]) or Fault.NONE
+    return _kind(*maps.factors[0]) or Fault.NONE
