@@ -12,7 +12,7 @@ from typing import Any
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.observability.resistance import PlanBudget, TermCheck
-from selfcal_ros.estimation.terms.planned import MISALIGNMENT_M, Assumed
+from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.terms import (
     DRIFT_DEGREE,
     MAX_DRIFT_DEGREE,
@@ -234,7 +234,7 @@ def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
              f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
              "one reading;",
              f"  plates placed within {math.degrees(assumed.turn_rad):g} deg and "
-             f"{MISALIGNMENT_M * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
+             f"{assumed.away_m * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
              "off the marks, drawn with a fixed seed"]
     if cut:
         names = ", ".join(f"'{view.name}'" for view in cut)

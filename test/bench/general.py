@@ -8,7 +8,7 @@ from scipy.sparse.linalg import lsmr, splu
 from timing import median_time
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.equations import clear_cache
+from selfcal_ros.estimation.normal.equations import system_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Measurements
@@ -79,7 +79,7 @@ def solved(size: int, method: str) -> tuple[float, float]:
     def field(data: Measurements, equations: Equations | None) -> np.ndarray:
         if equations is not None:
             return equations.solve(method)
-        clear_cache()
+        system_of.cache_clear()
         found = calibrate(data, options).error_map
         return np.stack([found.gx, found.gy])
 

@@ -87,13 +87,13 @@ def ours(benchmark: str, data) -> tuple:
     import numpy as np
 
     from selfcal_ros.estimation.api import calibrate
-    from selfcal_ros.estimation.normal.equations import clear_cache
+    from selfcal_ros.estimation.normal.equations import system_of
     from selfcal_ros.estimation.options import Options
 
     quick = Options(misalignment_model="linear", uncertainty=False, causes=False)
 
     def cold():
-        clear_cache()
+        system_of.cache_clear()
         return calibrate(data, quick).error_map
 
     if benchmark in ("solve", "without noise", "missing"):

@@ -10,7 +10,7 @@ import numpy as np
 from timing import median_time
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.normal.equations import clear_cache
+from selfcal_ros.estimation.normal.equations import system_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
@@ -44,7 +44,7 @@ def solved(size: int, terms: bool) -> tuple[float, None]:
     options = Options(terms=parse_terms([TERMS], "--terms") if terms else (), causes=False)
 
     def cold():
-        clear_cache()
+        system_of.cache_clear()
         return calibrate(data, options)
 
     calibrate(readings(5), Options(causes=False))

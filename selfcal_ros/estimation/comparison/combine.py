@@ -30,7 +30,7 @@ from selfcal_ros.estimation.comparison.maps import (
     variances_of,
     without,
 )
-from selfcal_ros.estimation.datum.covariance import NO_NOISE_M, USUAL_LEVEL
+from selfcal_ros.estimation.datum.covariance import NO_NOISE, USUAL_LEVEL
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solve import KEY, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
@@ -110,7 +110,7 @@ def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray]
                     raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
                                      f"{parts[first].name}: is it in µ{KINDS[kind]}?",
                                      "give m and rad")
-                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE_M) for n in (index, first))):
+                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE) for n in (index, first))):
                     raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
                                      "negative agrees, and it does not",
                                      "give G = indicated - true")

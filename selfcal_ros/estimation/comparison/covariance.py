@@ -30,7 +30,6 @@ from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solve import (
     BESIDE,
     KEY,
-    MAX_FULL,
     OF_PLATE,
     factors_of,
     kept_numbers,
@@ -39,8 +38,8 @@ from selfcal_ros.estimation.joint.solve import (
 )
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
-from selfcal_ros.estimation.normal.angular import MAX_LINES
-from selfcal_ros.estimation.normal.equations import SMALL_MAP, Marks, NormalEquations, system_of
+from selfcal_ros.estimation.normal.angular import MAX_FULL
+from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
@@ -108,7 +107,7 @@ def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """
     stored: dict[str, Any] = {}
     for kind, cover in covers.items():
-        if 0 < len(cover) <= 2 * SMALL_MAP:
+        if 0 < len(cover) <= MAX_FULL:
             scale = float(np.diag(cover).mean())
             stored[kind] = rounded(cover[np.tril_indices(len(cover))] / scale).tolist()
             stored[f"scale_{kind}"] = scale
@@ -344,7 +343,7 @@ class Together:
     def of_lines(self, known: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gtheta at lines for their unit noise, None if it is not kept."""
         result, system = self.result, self.system
-        if len(known) > MAX_LINES or not system.angular.n_views:
+        if len(known) > MAX_FULL or not system.angular.n_views:
             return None
         conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
                                     Sense(result.sense), self.half_width_m)
@@ -454,7 +453,7 @@ class Together:
         count, emap, plate = angular.n_lines, result.error_map, result.artifact_map
         known = np.isfinite(np.stack([emap.g_theta + emap.u_g_theta,
                                       plate.a_theta + plate.u_a_theta]))
-        if not angular.n_views or count > MAX_LINES or not known.any(axis=1).all():
+        if not angular.n_views or count > MAX_FULL or not known.any(axis=1).all():
             return np.zeros((2, count), dtype=bool), np.zeros((2 * count, 2 * count))
         centre = np.zeros((2 * count, 2 * count))
         for part, here in enumerate(known):

@@ -45,8 +45,8 @@ from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 
-NO_NOISE_M = 1e-100
-"""Stands for zero noise; its square is still representable."""
+NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
+"""Noise that stands for none: its square is still a number."""
 
 
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
@@ -169,7 +169,7 @@ class MapsCovariance:
         self._p, self._moved = inverse[:n, :n], self.terms.parameters[:n]
         self._scale = None if reference is None else scale_rows(system, reference)
         self._u = 0.0 if reference is None else (
-            reference.u_relative * half_width_m / max(sigma_m, NO_NOISE_M))
+            reference.u_relative * half_width_m / max(sigma_m, NO_NOISE))
 
     def of(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance (k, k) of functionals Re(conj(sites) G + conj(marks) A).

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
-from selfcal_ros.estimation.joint.problem import F_LEVEL, MAX_STEPS
+from selfcal_ros.estimation.joint.problem import F_LEVEL
+from selfcal_ros.estimation.normal.angular import MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.terms.equations import score

@@ -24,9 +24,8 @@ from selfcal_ros.blocks import Block, block_of
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
+    DECLARED_DOF,
     FLOOR,
-    MAX_FULL,
-    MAX_STEPS,
     NEGLIGIBLE,
     ROUNDING,
     JointFit,
@@ -39,10 +38,10 @@ from selfcal_ros.estimation.joint.problem import (
     sigma_of,
 )
 from selfcal_ros.estimation.lattice.maps import MapSpline
+from selfcal_ros.estimation.normal.angular import MAX_FULL, MAX_STEPS, ROUNDED
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
 from selfcal_ros.estimation.terms.equations import (
-    ROUNDED,
     ReducedColumns,
     SizeTest,
     TermEquations,
@@ -58,26 +57,10 @@ from selfcal_ros.estimation.terms.visits import ViewVisits, without_noise
 from selfcal_ros.model.artifact import Interpolation
 from selfcal_ros.model.terms import ModelTerm
 
-ROUGH_RESOLUTION = 1e-11
-"""Change of a reading, against the largest misalignment, at which rotations stand still once steps
-no longer shrink; before, `ROUNDED`."""
-
 LATE, OF_NOISE_LATE = 20, 0.1
 """Steps after which rounding is all that moves, and the change, against its standard uncertainty,
 that is none from then on: plates laid millimetres beside their places make the offsets, and their
 rounding, as large. An iteration whose smallest change lies as many steps back goes in circles."""
-
-FEW_DOF = 10
-"""Degrees of freedom of grid residuals below which those of lines count for the noise as well."""
-
-OFFSET_STEPS = 10
-"""Largest number of steps in which noise is removed from the microscope's offsets again."""
-
-SHRINKS = 0.5
-"""Ratio of two steps above which they no longer shrink."""
-
-DIVERGES = 1e3
-"""Ratio of a step to the largest reading above which the iteration diverges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,14 +150,13 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
         if change <= max(ROUNDED * largest, ROUNDING * peak):
             return state.finished()
-        stuck = number > 2 and change > SHRINKS * before
+        stuck = number > 2 and 2 * change > before
         part = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
-        if stuck and (change <= max(ROUGH_RESOLUTION * largest, FLOOR)
-                      or state.within_noise(part)):
+        if stuck and (change <= FLOOR or state.within_noise(part)):
             return state.finished()
         if change < smallest:
             smallest, found_at = change, number
-        if change > DIVERGES * peak or number - found_at >= LATE:
+        if peak < NEGLIGIBLE * change or number - found_at >= LATE:
             break
         before = change
     if problem.terms:
@@ -204,7 +186,7 @@ class _State:
         self.moving = Moving(problem)
         self.y = problem.grid.y
         self.found = fit(problem, self.y, self.theta)
-        self.offset_steps = OFFSET_STEPS
+        self.offset_steps = LATE
         self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
         self.equations: TermEquations | None = None
         self.reduced: ReducedColumns | None = None
@@ -310,7 +292,7 @@ class _State:
         sums = residual_sums(equations, now)
         total, dof = _of_lines(self.problem, self.found, equations,
                                equations.free_inverse @ now.total)
-        if sums.dof_between - dof < FEW_DOF or total > sums.between:
+        if sums.dof_between - dof < DECLARED_DOF or total > sums.between:
             total, dof = 0.0, 0.0
         residuals = sigma_of(sums.between - total, sums.dof_between - dof)
         rounded = residuals[0] == 0  # the weight of nearly exact lines leaves nothing else

@@ -16,6 +16,7 @@ from scipy.special import chdtrc, fdtrc
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
+from selfcal_ros.estimation.normal.equations import BLOCK
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 ADDED = "first_order_added"
@@ -23,9 +24,6 @@ ADDED = "first_order_added"
 
 MAX_STRUCTURED = 51 * 51
 """Largest field in which the axes are told apart: the time grows with the square of the sites."""
-
-CHUNK = 128
-"""Nodes whose sensitivities are computed together."""
 
 
 def axis_contrast(model: ModelFit) -> float:
@@ -115,8 +113,8 @@ def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray
     views = cover.system.grid.views
     shape, other = (views.plate_shape, views.shape) if plate else (views.shape, views.plate_shape)
     n, out = shape[0] * shape[1], []
-    for start in range(0, n, CHUNK):
-        unit = np.eye(min(CHUNK, n - start), n, start).reshape(-1, *shape)
+    for start in range(0, n, BLOCK):
+        unit = np.eye(min(BLOCK, n - start), n, start).reshape(-1, *shape)
         nothing = np.zeros((len(unit), *other))
         out.append([of(cover.sensitivities(*((nothing, unit * part) if plate else
                                              (unit * part, nothing)))) for part in (1, 1j)])

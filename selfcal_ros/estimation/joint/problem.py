@@ -13,6 +13,7 @@ from scipy.special import fdtrc, stdtrit
 
 from selfcal_ros.estimation.checks.wiring import F_LEVEL
 from selfcal_ros.estimation.datum.covariance import (
+    NO_NOISE,
     Conditions,
     conditions_for,
     scale_of,
@@ -21,6 +22,7 @@ from selfcal_ros.estimation.datum.covariance import (
 from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
+from selfcal_ros.estimation.normal.angular import MAX_STEPS
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options, ReferenceLength
@@ -30,10 +32,6 @@ from selfcal_ros.estimation.terms.visits import TermInputs, between_visits, squa
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm
-
-LEAST_DOF = 0.5
-"""Degrees of freedom of residuals below which they are rounding: terms with sizes leave fractions
-of one, however small."""
 
 DECLARED_DOF = 8.0
 """Degrees of freedom of a declared noise: it is known to a quarter (GUM G.4.2)."""
@@ -147,7 +145,7 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
     floor : float
         Noise at the level of rounding, which is not tested.
     """
-    if residuals[1] < LEAST_DOF:
+    if residuals[1] < 1:  # terms with sizes leave fractions of rounding
         residuals = (float("nan"), 0.0)
     identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
     base = (declared, float("inf")) if np.isfinite(declared) else (
@@ -186,13 +184,7 @@ FLOOR = 1e-13
 
 LEAST_NOISE_RAD = 1e-9
 """Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all
-that is assumed."""
-
-LEAST_PART = 1e-3
-"""The same as a part of the noise of marks, at the half width."""
-
-NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
-"""Noise that stands for none: its square is still a number."""
+that is assumed. And `NEGLIGIBLE`, as a part of the noise of marks at the half width."""
 
 MAX_WEIGHT = 1e8
 """Largest weight of one kind of readings against the other, all together: beyond, the lighter one
@@ -362,7 +354,7 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
 
 def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
     """Return the noise of lines that counts at least beside such a noise of marks, rad."""
-    return max(LEAST_NOISE_RAD, LEAST_PART * sigma_xy / problem.half_width_m)
+    return max(LEAST_NOISE_RAD, NEGLIGIBLE * sigma_xy / problem.half_width_m)
 
 
 def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
@@ -594,15 +586,6 @@ FAR = 0.02
 SAMPLES = 1000
 """Fewest sites of all draws of noise together: enough for a ratio of sums of squares."""
 
-MAX_FULL = 31 * 31
-"""Largest field with a full matrix over its sites, or over the coefficients of a finer map."""
-
-MAX_STEPS = 100
-"""Most steps of an iteration, of which good readings need a few."""
-
-SETTLED = 1e-2
-"""Relative change of the map of a draw below which it has converged."""
-
 
 class Moving:
     """Contribution of stops off the sites to the readings, updated at each iteration.
@@ -675,7 +658,7 @@ def noise_gain(problem: Problem, found: JointFit) -> np.ndarray:
         for _ in range(MAX_STEPS):
             changes = places.changes(places.moved(now, there), problem.turn_rad)
             before, now = now, fit(problem, y - changes, still).field
-            if np.abs(now - before).max() <= SETTLED * np.abs(now).max():
+            if np.abs(now - before).max() <= NEGLIGIBLE * np.abs(now).max():
                 break
         sums += np.stack([np.abs(now) ** 2, np.abs(plain) ** 2])
     ratio = _with_neighbours(np.where(problem.system.known_sites, sums, 0.0))

@@ -23,7 +23,7 @@ from selfcal_ros.errors import (
     NotSettledError,
 )
 from selfcal_ros.estimation.datum.covariance import (
-    NO_NOISE_M,
+    NO_NOISE,
     LinesCovariance,
     MapsCovariance,
     misclosure_test,
@@ -38,7 +38,6 @@ from selfcal_ros.estimation.joint.noise_effects import (
     structured,
 )
 from selfcal_ros.estimation.joint.problem import (
-    MAX_FULL,
     NEGLIGIBLE,
     NoiseEstimate,
     Problem,
@@ -47,6 +46,7 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import MAX_FULL, ROUNDED
 from selfcal_ros.estimation.normal.equations import NormalEquations, system_for
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
@@ -55,7 +55,6 @@ from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     LEAST_NOISE_M,
-    ROUNDED,
     TermEquations,
     require_terms_told,
     roots_by_term,
@@ -464,7 +463,7 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     asked = options.uncertainty
     wanted = problem.system.grid.n_sites <= UNASKED_SITES if asked is None else asked
     exact = options.reference is not None and found.xy.sigma == 0
-    least = NO_NOISE_M if exact else found.xy.sigma  # 0 would hide the u of the reference
+    least = NO_NOISE if exact else found.xy.sigma  # 0 would hide the u of the reference
     sigma = np.full(problem.system.known_sites.shape, least)
     if wanted:
         sigma = sigma * noise_gain(problem, found)

@@ -545,7 +545,6 @@ def _inverse(lower: np.ndarray) -> np.ndarray:
 
 _lock = RLock()
 _limits: list[Any] = []
-_depth = 0
 
 
 _controller = cache(ThreadpoolController)
@@ -557,15 +556,12 @@ def one_thread() -> Iterator[None]:
 
     The number is restored when the outermost block of any thread of this process has ended.
     """
-    global _depth
     with _lock:
-        _depth += 1
-        if _depth == 1:
-            _limits.append(_controller().limit(limits=1, user_api="blas"))
+        _limits.append(_limits[0] if _limits else _controller().limit(limits=1, user_api="blas"))
     try:
         yield
     finally:
         with _lock:
-            _depth -= 1
-            if _depth == 0:
-                _limits.pop().restore_original_limits()
+            last = _limits.pop()
+            if not _limits:
+                last.restore_original_limits()

@@ -13,15 +13,21 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from selfcal_ros.compensation.circle import fourier_basis, fourier_coefficients
 from selfcal_ros.estimation.lattice.connectivity import Components, components, rest_on_one
 
-MAX_LINES = 1024
-"""Largest number of lines with dense matrices over them: 8 MB each."""
+MAX_FULL = 31 * 31
+"""Largest number of values with full matrices over them: 7 MB each."""
+
+MAX_STEPS = 100
+"""Most steps of an iteration, of which good readings need a few."""
+
+ROUNDED = 1e-12
+"""Relative size of what is rounding alone, an eigenvalue, a variance, a factor, a change: exact
+lines leave eigenvalues of 1e-9 that are told."""
 
 
 class AngularSystem:
@@ -138,15 +144,11 @@ class AngularSystem:
 
     @cached_property
     def _factor(self) -> Any:
-        if self.n_lines <= MAX_LINES:
-            return lapack.dpotrf(self.matrix.toarray(), lower=1)[0]
         return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                     options={"SymmetricMode": True})
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution of the pinned system for (K,) or (K, k)."""
-        if self.n_lines <= MAX_LINES:
-            return lapack.dpotrs(self._factor, right, lower=1)[0].reshape(right.shape)
         return self._factor.solve(right)
 
     @cached_property

@@ -9,12 +9,9 @@ the datum is below `KNOWN` readings' noise; the datum is that of the known nodes
 Equations are made once for each plan, planned or measured, and kept.
 """
 
-import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from threading import Lock
+from functools import cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,7 +29,15 @@ from selfcal_ros.estimation.lattice.readings import (
     in_field,
     pose_of,
 )
-from selfcal_ros.estimation.normal.angular import GAP, KNOWN, AngularSystem, HarmonicSystem
+from selfcal_ros.estimation.normal.angular import (
+    GAP,
+    KNOWN,
+    MAX_FULL,
+    MAX_STEPS,
+    ROUNDED,
+    AngularSystem,
+    HarmonicSystem,
+)
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
@@ -377,23 +382,11 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     return angular.plate(y, free - angular.response @ phi, phi)[1]
 
 
-MOST_DATUMS = 12
-"""Most datums from that of the core to that of the known nodes."""
-
 CORE = 0.75
 """Distance from the centre, in half widths, within which nodes fix the first datum."""
 
-VAGUE = 1e-13
-"""Information on every node, relative to the mean, that keeps the factorisation alive."""
-
-LOOSE = 10.0
-"""Standard uncertainty of an undetermined field, in units of the noise of one reading."""
-
-SMALL_MAP = 21 * 21
-"""Largest map whose undetermined fields are sought, or whose covariance a result keeps: 3.5 MB."""
-
-BLOCK = 1024
-"""Number of marks computed at once."""
+BLOCK = 128
+"""Number of marks, nodes or lines computed at once."""
 
 MAX_NODES = 57 * 57
 """Largest map whose matrix is factorised: 2 GB and half a minute."""
@@ -482,7 +475,10 @@ class PlacedSystem(GridSystem):
 
     @cached_property
     def matrix(self) -> np.ndarray:
-        """The matrix over the nodes, marks eliminated, complex (n, n); `VAGUE` on its diagonal."""
+        """The matrix over the nodes, marks eliminated, complex (n, n).
+
+        With `vague` on its diagonal.
+        """
         n = self.n_sites
         if n > MAX_NODES:
             raise InputError("map grid_size", f"{n} nodes are more than {MAX_NODES}",
@@ -500,7 +496,7 @@ class PlacedSystem(GridSystem):
     @property
     def vague(self) -> float:
         """Information added to every node: too little to change a known one."""
-        return float(VAGUE * self.weight.sum() / self.n_sites)
+        return float(ROUNDED * self.weight.sum() / self.n_sites)
 
     @cached_property
     def factor(self) -> DenseFactor:  # type: ignore[override]
@@ -562,7 +558,7 @@ class PlacedEquations(NormalEquations):
         if known.sum() < 3:  # three nodes a side
             known = some
         settled = 0
-        for _ in range(MOST_DATUMS):
+        for _ in range(MAX_STEPS):
             if known.sum() < 3 or settled == 2:
                 break
             datum = Gauge(views.z_sites, known, scale=not self.grid.known_plate)
@@ -587,13 +583,13 @@ class PlacedEquations(NormalEquations):
 
     @cached_property
     def loose_modes(self) -> np.ndarray:
-        """Fields with a standard uncertainty beyond `LOOSE` readings' noise, the worst first.
+        """Fields with a standard uncertainty beyond `KNOWN` readings' noise, the worst first.
 
-        Complex (modes, cx, cy), of length 1; those of a map of more than `SMALL_MAP` nodes are not
-        sought.
+        Complex (modes, cx, cy), of length 1; not sought where a full matrix over both coordinates
+        is too large.
         """
         views, n = self.grid.views, self.grid.n_sites
-        if n > SMALL_MAP:
+        if 2 * n > MAX_FULL:
             return super().loose_modes
         inverse, response = self.grid.factor.inverse, self.grid.response
         cover = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
@@ -604,22 +600,13 @@ class PlacedEquations(NormalEquations):
         cover -= rigid @ (rigid.T @ cover)
         cover -= (cover @ rigid) @ rigid.T
         values, vectors = np.linalg.eigh(cover)
-        loose = vectors[:, values > LOOSE**2][:, ::-1]
+        loose = vectors[:, values > KNOWN**2][:, ::-1]
         return (loose[:n] + 1j * loose[n:]).T.reshape(-1, *views.shape)
 
     @cached_property
     def known_marks(self) -> np.ndarray:
         """Marks read where the map is known, bool (nx, ny)."""
         return (self.grid.read & self.grid.views.near(self.known_sites)).any(axis=0)
-
-
-CACHED = 16
-CACHED_READINGS = 4_000_000
-"""Limits of the cache: number of plans, and of readings in all of them."""
-
-
-_cache: OrderedDict[tuple, NormalEquations] = OrderedDict()
-_lock = Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -647,6 +634,19 @@ class Marks[Pose]:
     rotations: tuple[int, ...] = ()
     known_plate: bool = False
 
+    @cached_property
+    def _key(self) -> tuple:
+        return (self.poses, self.index, self.harmonics, self.rotations, self.known_plate,
+                self.weight.shape, self.weight.tobytes())
+
+    def __hash__(self) -> int:
+        """Return that of all that the equations depend on."""
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether other marks have the same equations."""
+        return getattr(other, "_key", None) == self._key
+
 
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
     """Return the system of a measured plan, from the cache if the same marks were read."""
@@ -654,24 +654,10 @@ def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
                      Marks(angular.turns, angular.weight, angular.index, angular.harmonics))
 
 
+@lru_cache(maxsize=4)
 def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
-    """Return the system of marks that were read, from the cache if present."""
-    digest = hashlib.blake2b(grid.weight, digest_size=16)
-    digest.update(angular.weight)
-    key = (grid.weight.shape, grid.poses, grid.index, grid.rotations, grid.known_plate,
-           angular.known_plate, angular.weight.shape,
-           angular.poses, angular.index, angular.harmonics, digest.digest())
-    with _lock:
-        if key in _cache:
-            _cache.move_to_end(key)
-            return _cache[key]
-    system = _equations(grid, angular)
-    with _lock:
-        _cache[key] = system
-        while len(_cache) > 1 and (len(_cache) > CACHED or sum(
-                known.grid.weight.size for known in _cache.values()) > CACHED_READINGS):
-            _cache.popitem(last=False)
-    return system
+    """Return the system of marks that were read; the last few are kept."""
+    return _equations(grid, angular)
 
 
 def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
@@ -693,12 +679,6 @@ def lines_of(angular: Marks[float]) -> AngularSystem:
         return HarmonicSystem(angular.poses, angular.weight, angular.harmonics,
                               known_plate=angular.known_plate)
     return AngularSystem(angular.poses, angular.weight, known_plate=angular.known_plate)
-
-
-def clear_cache() -> None:
-    """Remove all systems."""
-    with _lock:
-        _cache.clear()
 
 
 def planned_system(artifact: Artifact, views: Sequence[View], *,

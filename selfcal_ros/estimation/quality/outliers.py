@@ -31,8 +31,9 @@ from scipy.special import chdtri
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.joint.problem import FLOOR, Problem
-from selfcal_ros.estimation.joint.solve import MAX_FULL, fit_joint, prepare
+from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import TRACE, Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (

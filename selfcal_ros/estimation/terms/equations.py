@@ -26,8 +26,8 @@ from scipy.special import chdtri, fdtrc
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
-from selfcal_ros.estimation.normal.angular import GAP, AngularSystem
-from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.angular import GAP, ROUNDED, AngularSystem
+from selfcal_ros.estimation.normal.equations import TRACE, NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
 from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
@@ -226,17 +226,9 @@ def lines_eliminated(angular: AngularSystem,
     return free, weighted.sum(axis=1) - angular.columns.T @ free, (gram + gram.T) / 2
 
 
-ROUNDED = 1e-12
-"""Relative size of what is rounding alone, an eigenvalue, a variance, a factor, a change: exact
-lines leave eigenvalues of 1e-9 that are told."""
-
 OVER_NOISE = 100.0
 """Ratio of the variance of the offsets to that of their noise from which they determine a
 microscope: below, they would be dominated by their own noise, which is in the readings as well."""
-
-MOVES_THE_MAP = 1e-5
-"""Relative rms of the map above which a combination of columns that cannot be seen is an
-undetermined mode: rounding gives 1e-9, the smallest true ones 1e-2."""
 
 FREE = ""
 """Name of the part of a covariance that all free terms have together."""
@@ -375,7 +367,7 @@ class TermEquations:
                                 / max(len(lines), 1))
         both = np.concatenate([moved.real, moved.imag, lines])
         _, size, right = np.linalg.svd(both, full_matrices=False)
-        return untold @ right[size > MOVES_THE_MAP].T
+        return untold @ right[size > TRACE].T  # the smallest true ones are 1e-2
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which coefficients belong to the terms `names`, bool (p,)."""

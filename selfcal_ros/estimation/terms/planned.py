@@ -34,9 +34,6 @@ from selfcal_ros.model.view import (
 )
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
-MISALIGNMENT_M = 30e-6
-"""Standard deviation of the position of a plate along each axis."""
-
 SEED = 1
 """Seed of the stop errors and random visiting orders assumed for a plan."""
 
@@ -64,6 +61,8 @@ class Assumed:
         Noise of one reading of a line, rad.
     turn_rad : float
         Rotation by which plates are placed, standard deviation, rad.
+    away_m : float
+        Position in which plates are placed, standard deviation along each axis, m.
     error_m : float
         Standard deviation of the errors of stage and plate, each and per axis, m. They are offsets
         of marks at which a stage stops exactly on its targets.
@@ -75,6 +74,7 @@ class Assumed:
     order: str = ""
     sigma_rad: float = math.radians(1e-3)
     turn_rad: float = math.radians(0.3)
+    away_m: float = 30e-6
     error_m: float = 1e-6
 
 
@@ -122,7 +122,7 @@ def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Gen
     `known`: its misalignment in standard deviations, (3,); errors of stage and plate,
     (2, nx, ny), m.
     """
-    turn, x, y = known[0] * (assumed.turn_rad, MISALIGNMENT_M, MISALIGNMENT_M)
+    turn, x, y = known[0] * (assumed.turn_rad, assumed.away_m, assumed.away_m)
     errors = known[1]
     order = assumed.order or view.visit_order or DEFAULT_ORDER
     found = visit_sequence(artifact, view, order=order, rng=rng) if parse_order(

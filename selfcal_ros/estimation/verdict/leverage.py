@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.problem import FLOOR
-from selfcal_ros.estimation.normal.angular import MAX_LINES, AngularSystem
+from selfcal_ros.estimation.normal.angular import MAX_FULL, AngularSystem
 from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
@@ -167,7 +167,7 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
     angular = system.angular
     if not angular.n_views:
         return np.zeros(angular.weight.shape)
-    if angular.n_lines > MAX_LINES:
+    if angular.n_lines > MAX_FULL:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
     inverse = angular.solve(np.eye(angular.n_lines))

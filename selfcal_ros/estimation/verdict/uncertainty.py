@@ -17,11 +17,11 @@ from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
 from selfcal_ros.estimation.joint.solve import (
     ANGULAR_KEY,
     KEY,
-    MAX_FULL,
     OF_PLATE,
     rounded,
     variance_of_terms,
 )
+from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult, Noise

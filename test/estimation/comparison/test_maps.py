@@ -70,7 +70,7 @@ def test_maps_of_the_same_marks_share_their_equations_and_others_do_not(monkeypa
     made = []
     monkeypatch.setattr(equations, "NormalEquations",
                         lambda *given, **kw: made.append(given) or NormalEquations(*given, **kw))
-    equations.clear_cache()
+    equations.system_of.cache_clear()
     compare(A, B)
     assert len(made) == 1
     repeated = replace(B, views=tuple(replace(v, read_angular=2) for v in B.views))

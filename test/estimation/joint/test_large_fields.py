@@ -32,9 +32,9 @@ def test_the_core_of_a_large_plan_tells_its_rank_alone(monkeypatch, names, missi
     plan = plan_of(names, Artifact(21, 0.005))
     small = plan_observability(plan)
     monkeypatch.setattr(equations, "CORE", 9)
-    equations.clear_cache()
+    equations.system_of.cache_clear()
     assert plan_observability(plan) == small
-    equations.clear_cache()
+    equations.system_of.cache_clear()
 
 
 def test_the_uncertainty_of_a_large_field_is_given_on_request(monkeypatch):
@@ -74,7 +74,7 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
 
 def test_the_number_of_threads_changes_no_bit(capsys):
     """Here with one thread and in a process with several."""
-    equations.clear_cache()
+    equations.system_of.cache_clear()
     with threadpool_limits(1):
         exec(SCRIPT, {})
     alone = capsys.readouterr().out

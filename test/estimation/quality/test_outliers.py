@@ -91,7 +91,7 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
 def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkeypatch):
     _, readings = measured(missing=0.1)
     system = residuals_of(readings, ZERO_MEAN).problem.system
-    monkeypatch.setattr(leverage, "MAX_LINES", 0)
+    monkeypatch.setattr(leverage, "MAX_FULL", 0)
     assert angular_redundancy(system).sum() == pytest.approx(
         system.angular.n_readings - system.rank_angular, rel=1e-9)
 
