@@ -12,9 +12,8 @@ misalignments make of them: the noise of that mean is independent of both. So th
 functionals of G and A follows from M, Y and P (method eq. 4.14).
 
 A map in its datum is the free one, and a few fields times as many functionals of both free maps.
-That gives the variance of every site. Stage and plate exchange their parts: a view that lays mark m
-on site X lays site X on mark m by the inverse pose. So on a lattice the variances of the plate are
-those of a stage in the exchanged equations, where the marks are left (method eq. 4.13).
+That gives the variance of every site; and of every mark: by the readings alone that of its mean
+noise, and that of the mean of the stage at its sites (method eq. 4.13).
 
 The datum of the angular maps is zero mean, or Hu's four axis conditions (eqs. 9, 27). The four
 conditions fix one free constant and test three differences. They must not bend the XY map, so they
@@ -30,19 +29,14 @@ from scipy.special import chdtrc
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.equations import (
     BLOCK,
-    Marks,
     Memo,
     NormalEquations,
-    PlacedSystem,
     in_datum,
-    system_of,
 )
 from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
-from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 
 NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
@@ -224,17 +218,14 @@ class MapsCovariance:
     def of_stage(self) -> np.ndarray:
         """Variances of Gx and Gy at every site, (2, nx, ny); NaN if unknown."""
         system = self.system
-        variance = self._of_sites(*self._datum(plate=False)) + self._of_length(
-            system.grid.views.z_sites)
+        variance = self._of_map(plate=False) + self._of_length(system.grid.views.z_sites)
         return np.where(system.known_sites, variance.reshape(2, *system.known_sites.shape), np.nan)
 
     @cached_property
     def of_plate(self) -> np.ndarray:
         """Variances of Ax and Ay at every mark, (2, nx, ny); NaN if unknown."""
-        system, (fields, g, a) = self.system, self._datum(plate=True)
-        variance = self._of_marks(system.grid, fields, g, a) if isinstance(
-            system.grid, PlacedSystem) else self._exchanged()._of_sites(fields, a, g)
-        variance = variance + self._of_length(system.grid.views.z)
+        system = self.system
+        variance = self._of_map(plate=True) + self._of_length(system.grid.views.z)
         return np.where(system.known_marks, variance.reshape(2, *system.known_marks.shape), np.nan)
 
     def maps_of_terms(self) -> tuple[np.ndarray, np.ndarray]:
@@ -336,24 +327,17 @@ class MapsCovariance:
         field = grid.factor.solve(np.ascontiguousarray(g)) - grid.response @ parameters
         return field, parameters, taken
 
-    def _of_sites(self, fields: np.ndarray, g: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the variances of the stage's map in a datum as in `_datum`, (2, sites)."""
-        grid = self.system.grid
-        field, _, taken = self._solved(g, a)
-        return in_datum(grid.factor.inverse_diagonal(),
-                        ((grid.response, self._p), (self.terms.fields, self.terms.covariance)),
-                        field - self.terms.fields @ taken, fields, self.of_free(g, a))
-
-    def _of_marks(self, grid: PlacedSystem, fields: np.ndarray, g: np.ndarray,
-                  a: np.ndarray) -> np.ndarray:
-        """Return the variances of the plate's map, for views off the lattice, (2, marks)."""
-        plates = self.terms.plates
+    def _of_map(self, *, plate: bool) -> np.ndarray:
+        """Return the variances of a map in its datum, (2, places), but for the reference's own."""
+        grid, (fields, g, a) = self.system.grid, self._datum(plate=plate)
         field, parameters, taken = self._solved(g, a)
-        spread = self._plates(field, parameters) + self._noise[:, None] * a - plates @ taken
-        answer = self._plates(-grid.response, np.eye(len(self._p)))
-        return in_datum(self._noise + grid.variance_of_means(),
-                        ((answer, self._p), (plates, self.terms.covariance)), spread, fields,
-                        self.of_free(g, a))
+        own, answer, of_terms = grid.variance_of_sites, grid.response, self.terms.fields
+        if plate:
+            field = self._plates(field, parameters) + self._noise[:, None] * a
+            own, of_terms = self._noise + grid.variance_of_means, self.terms.plates
+            answer = self._plates(-answer, np.eye(len(self._p)))
+        return in_datum(own, ((answer, self._p), (of_terms, self.terms.covariance)),
+                        field - of_terms @ taken, fields, self.of_free(g, a))
 
     def _plates(self, fields: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return what maps (sites, k) and misalignments (3 views, k) make of the plate."""
@@ -361,32 +345,6 @@ class MapsCovariance:
         maps = fields.T.reshape(-1, *grid.views.shape)
         plates = grid.plate(np.zeros(grid.weight.shape), maps, parameters.T)[0]
         return plates.reshape(len(maps), -1).T
-
-    def _exchanged(self) -> "MapsCovariance":
-        """Return the covariance with stage and plate exchanged, on a lattice."""
-        system, terms = self.system, self.terms
-        grid, views = system.grid, system.grid.views
-        poses, n = [], 3 * grid.n_views
-        move = np.zeros((n, n))
-        for v, pose in enumerate(views.poses):
-            turn = PHASES[pose.q]
-            back = -turn.conj() * (pose.a + 1j * pose.b)
-            poses.append(LatticePose(-pose.q % 4, (back.real + 0.0, back.imag + 0.0), None))
-            # about the centre of the field, in the stage frame: phi, t - phi i T (T: the shift)
-            move[3 * v:3 * v + 3, 3 * v:3 * v + 3] = [
-                [1, 0, 0], [pose.b / views.unit, turn.real, -turn.imag],
-                [-pose.a / views.unit, turn.imag, turn.real]]
-        weight = np.zeros((grid.n_views, grid.n_sites))
-        view, mark = np.nonzero(grid.read.reshape(grid.n_views, -1))
-        site = views.site_index.reshape(grid.n_views, -1)[view, mark]
-        weight[view, site] = grid.weight.reshape(grid.n_views, -1)[view, mark]
-        other = system_of(
-            Marks(tuple(poses), weight.reshape(grid.weight.shape), system.grid_index,
-                  rotations=grid.rotations),
-            Marks((), np.zeros((0, system.angular.n_lines)), ()))
-        return MapsCovariance(other, move @ self._p @ move.T, terms=TermSpread(
-            terms.columns, terms.lines, terms.plates, terms.fields, move @ self._moved,
-            terms.turned, terms.covariance))
 
 
 USUAL_LEVEL = 0.05

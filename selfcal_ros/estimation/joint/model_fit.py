@@ -393,8 +393,8 @@ class FinerEquations(PlacedEquations):
 
 def told_coefficients(system: PlacedEquations) -> float:
     """Return the real coefficients of a map that the readings determine."""
-    factor, n = system.grid.factor, system.grid.n_sites
-    return 2 * (n - system.grid.vague * float(factor.inverse_diagonal().sum()))
+    grid = system.grid
+    return 2 * (grid.n_sites - grid.vague * float(grid.variance_of_sites.sum()))
 
 
 def placed(problem: Problem) -> PlacedEquations | None:

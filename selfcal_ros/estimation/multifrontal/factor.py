@@ -22,7 +22,7 @@ cuts through the folded field separate the matrix.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations, pairwise
 from threading import RLock
 from typing import Any
@@ -59,6 +59,10 @@ class RealSymmetricForm:
         i^k: G = i^k h.
     pins : float array (cut,)
         Values added to the diagonal of the cut sites.
+    of_reading : int array (views, marks)
+        Variable of each reading.
+    shares : float array (views, marks)
+        Its share in the mean of its mark.
     """
 
     rows: np.ndarray
@@ -71,6 +75,8 @@ class RealSymmetricForm:
     copy_phase: np.ndarray
     phase: np.ndarray
     pins: np.ndarray
+    of_reading: np.ndarray
+    shares: np.ndarray
 
 
 def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
@@ -113,7 +119,8 @@ def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
     return RealSymmetricForm(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
-                             PHASES[quadrant], cut_pins)
+                             PHASES[quadrant], cut_pins, variable,
+                             relative_weight.reshape(read.shape))
 
 
 def _quadrants(shape: tuple[int, int]) -> np.ndarray:
@@ -430,38 +437,46 @@ class Factor:
                 own = own - below.T @ later.reshape(len(below), -1)
             real[front.start:front.stop] = inverse.T @ own
 
-    def inverse_diagonal(self) -> np.ndarray:
-        """Return the diagonal of the inverse, real (sites,)."""
-        folded, fronts = self.folded, self.dissection.fronts
-        out = np.empty(len(folded.phase))
-        out[folded.cut] = self._cut_inverse.diagonal().real
+    @cached_property
+    def variances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Variances of the sites, (sites,), and of the mean of each mark's sites, (marks,).
+
+        The sites of a mark are joined: all of them are in the front in which the first is
+        eliminated.
+        """
+        folded, fronts, n = self.folded, self.dissection.fronts, self._n_free
+        sites = folded.free[self.dissection.order]
+        place = np.arange(folded.size)
+        place[self.dissection.order] = np.arange(n)
+        place, shares = place[folded.of_reading], folded.shares
+        first = np.where(shares > 0, place, folded.size).min(axis=0)
+        place = np.where(shares > 0, place, first)
+        marks = np.argsort(first, kind="stable")
+        after = first[marks]
+
+        def of_means(z: np.ndarray, mine: np.ndarray, at: np.ndarray) -> np.ndarray:
+            return np.einsum("vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at])
+
+        own, means = np.empty(len(folded.phase)), np.zeros(len(marks))
+        own[folded.cut] = self._cut_inverse.diagonal().real
         copies = self._cut_inverse[folded.copy_of[:, None], folded.copy_of]
         copies = (folded.copy_phase[:, None] * copies * folded.copy_phase.conj()).real
+        mine = marks[(after >= n) & (after < folded.size)]
+        means[mine] = of_means(copies, mine, place[:, mine] - n)
         needed = {}
         for number in self.dissection.top:
-            places = fronts[number].boundary - self._n_free
+            places = fronts[number].boundary - n
             needed[number] = copies[places[:, None], places]
-        sites = folded.free[self.dissection.order]
         for number in range(len(fronts) - 1, -1, -1):
-            front, own = fronts[number], fronts[number].stop - fronts[number].start
-            if not front.children:
-                out[sites[front.start:front.stop]] = self._diagonal(number, needed.pop(number))
-                continue
+            front = fronts[number]
             z = self._selected(number, needed.pop(number))
-            out[sites[front.start:front.stop]] = z[:own, :own].diagonal()
+            own[sites[front.start:front.stop]] = z.diagonal()[:front.stop - front.start]
+            mine = marks[slice(*np.searchsorted(after, (front.start, front.stop)))]
+            means[mine] = of_means(z, mine, front.places(place[:, mine]))
             for child in front.children:
                 places = front.places(fronts[child].boundary)
                 needed[child] = z[places[:, None], places]
-        return out
-
-    def _diagonal(self, number: int, z22: np.ndarray) -> np.ndarray:
-        """Return the diagonal of `_selected` for a front without children.
-
-        Z11 = J' J + (Y J)' Z22 (Y J).
-        """
-        lower, below = self._blocks[number]
-        carried = below @ lower
-        return (lower * lower).sum(axis=0) + (carried * (z22 @ carried)).sum(axis=0)
+        return own, means
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given the inverse over its boundary."""

@@ -426,10 +426,6 @@ class DenseFactor:
         lower = np.tril(lapack.zpotri(self._lower, lower=1)[0])
         return lower + np.tril(lower, -1).conj().T
 
-    def inverse_diagonal(self) -> np.ndarray:
-        """Return the diagonal of the inverse, real (n,)."""
-        return self.inverse.diagonal().real.copy()
-
 
 class PlacedSystem(GridSystem):
     """Normal equations of grid readings at any pose, independent of their values.
@@ -503,11 +499,14 @@ class PlacedSystem(GridSystem):
         """Factorisation of the matrix over the nodes."""
         return DenseFactor(self.matrix)
 
-    def variance_of_means(self) -> np.ndarray:
-        """Return the variance of the mean of the stage errors at the sites of each mark, (marks,).
+    @property
+    def variance_of_sites(self) -> np.ndarray:
+        """Variance of the stage error at each node, (nodes,): known misalignments, unit noise."""
+        return self.factor.inverse.diagonal().real
 
-        For known misalignments and unit noise.
-        """
+    @cached_property
+    def variance_of_means(self) -> np.ndarray:
+        """Variance of the mean stage error at the sites of each mark, (marks,), likewise."""
         views = self.views
         rows = csr_matrix((self.n_marks, self.n_sites), dtype=complex)
         for one, phase, part in zip(views.rows, views.phases, self.relative_weight, strict=True):
@@ -578,7 +577,7 @@ class PlacedEquations(NormalEquations):
         factor, response, own = self.grid.factor, self.grid.response, inverse[:n, :n]
         spread = factor.inverse @ rigid + response @ (
             own @ np.real(response.conj().T @ rigid))
-        return in_datum(factor.inverse_diagonal(), ((response, own),), spread, -datum.everywhere,
+        return in_datum(self.grid.variance_of_sites, ((response, own),), spread, -datum.everywhere,
                         np.real(rigid.conj().T @ spread))
 
     @cached_property

@@ -132,6 +132,16 @@ class GridSystem:
         folded = fold(self.views, self.weight, self.relative_weight, self.pins)
         return Factor(folded, self.views.shape, self.views.reach)
 
+    @property
+    def variance_of_sites(self) -> np.ndarray:
+        """Variance of the stage error at each site, (sites,): known misalignments, unit noise."""
+        return self.factor.variances[0]
+
+    @property
+    def variance_of_means(self) -> np.ndarray:
+        """Variance of the mean stage error at the sites of each mark, (marks,), likewise."""
+        return self.factor.variances[1]
+
     @cached_property
     def shapes(self) -> np.ndarray:
         """Effect of phi and Re tau of a view on its readings: i z and 1, complex (2, nx, ny)."""
