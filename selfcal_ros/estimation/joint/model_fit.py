@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, block_of
+from selfcal_ros.blocks import Block
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
@@ -40,15 +40,12 @@ from selfcal_ros.estimation.joint.problem import (
 from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import MAX_FULL, MAX_STEPS, ROUNDED
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
-from selfcal_ros.estimation.terms.columns import TermColumns, made_anew, term_columns
+from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import (
-    ReducedColumns,
     SizeTest,
     TermEquations,
     equations_of_columns,
     next_coefficients,
-    reduce_anew,
-    reduce_columns,
     residual_sums,
     score,
     size_tests,
@@ -79,8 +76,6 @@ class ModelFit:
         Of the terms' columns.
     y : complex array (views, nx, ny)
         Deviations as the last linear step took them.
-    reduced : ReducedColumns or None
-        The terms' columns with the sites eliminated.
     sizes : tuple of SizeTest
         The test of every size. In place of one that the readings contradict the fit, and with it
         every uncertainty, has the largest that they allow.
@@ -91,7 +86,6 @@ class ModelFit:
     equations: TermEquations | None
     coefficients: np.ndarray
     y: np.ndarray
-    reduced: ReducedColumns | None = None
     sizes: tuple[SizeTest, ...] = ()
 
     @property
@@ -119,7 +113,7 @@ class ModelFit:
         """What the terms' uncertainty does to the maps; None without terms."""
         if self.equations is None:
             return None
-        now = equations_of(self.problem, self.found, self.equations.columns, self.reduced)
+        now = equations_of(self.problem, self.found, self.equations.columns)
         return spread_of(now, now.inverse(self.found.xy.sigma))
 
 
@@ -168,12 +162,11 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
                           "check the readings for misalignments of more than a few degrees")
 
 
-def equations_of(problem: Problem, found: JointFit, columns: TermColumns,
-                 reduced: ReducedColumns | None = None) -> TermEquations:
+def equations_of(problem: Problem, found: JointFit, columns: TermColumns) -> TermEquations:
     """Return the equations of columns about the estimate `found`."""
     noises = filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals))
     return equations_of_columns(
-        problem.system, columns, found.inverse, ratio=found.ratio, reduced=reduced,
+        problem.system, columns, found.inverse, ratio=found.ratio,
         half_width_m=problem.half_width_m, noise_m=min(noises, default=0.0))
 
 
@@ -189,45 +182,35 @@ class _State:
         self.offset_steps = LATE
         self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
         self.equations: TermEquations | None = None
-        self.reduced: ReducedColumns | None = None
-        self.of_offsets = next((term for term in problem.terms
-                                if block_of(term.name).of_offsets), None)
+        self.of_offsets = any(term.block.of_offsets for term in problem.terms)
         if problem.terms:
             ground = without_noise(problem.ground, self.found.residuals)
-            columns = term_columns(ground, problem.terms)
-            self._linearise(columns, reduce_columns(problem.system.grid, columns.shapes))
+            self._linearise(term_columns(ground, problem.terms))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
 
-    def _linearise(self, columns: TermColumns, reduced: ReducedColumns) -> None:
+    def _linearise(self, columns: TermColumns) -> None:
         """Set up the equations of the terms about the present solution."""
-        self.weights, self.ratio, self.reduced = self.found.inverse, self.found.ratio, reduced
-        self.equations = equations_of(self.problem, self.found, columns, reduced)
+        self.weights, self.ratio = self.found.inverse, self.found.ratio
+        self.equations = equations_of(self.problem, self.found, columns)
 
-    def _refresh(self, equations: TermEquations, reduced: ReducedColumns) -> None:
-        """Set up what has changed of the equations: the offsets' columns, or weights."""
-        columns = equations.columns
+    def _refresh(self, equations: TermEquations) -> None:
+        """Set up the equations again where visits, offsets or weights have changed."""
         if 0 < self.steps <= self.offset_steps and (self.of_offsets or self.problem.moves):
-            columns = self._anew(columns)
-            if self.of_offsets is not None:
-                reduced = reduce_anew(self.problem.system.grid, columns.shapes, reduced,
-                                      columns.having(lambda block: block.of_offsets))
-        elif not self._stale(equations):
-            return
-        self._linearise(columns, reduced)
+            self._linearise(self._anew(equations.columns))
+        elif self._stale(equations):
+            self._linearise(equations.columns)
 
     def _anew(self, before: TermColumns) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
         ground = without_noise(self.moving.ground(self.found), self.found.residuals,
                                before.at_visits(self.coefficients))
-        columns = made_anew(ground, self.of_offsets, before, moved=self.problem.moves)
-        if self.of_offsets is None:
-            return columns
+        columns = term_columns(ground, self.problem.terms)
         rows = columns.having(lambda block: block.of_offsets)
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
-        if np.abs(effect).max() <= ROUNDED * largest:
+        if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
 
@@ -247,8 +230,8 @@ class _State:
         readings may where the misalignments take it up; not so what places of the stage change.
         """
         parameters, y = self.found.parameters, self.y
-        if self.equations is not None and self.reduced is not None:
-            self._refresh(self.equations, self.reduced)
+        if self.equations is not None:
+            self._refresh(self.equations)
         self.steps += 1
         if self.equations is not None:
             self._solve_terms(self.equations)
@@ -279,12 +262,10 @@ class _State:
         return still and self.moving.change <= part * of_view
 
     def finished(self) -> ModelFit:
-        equations, reduced = self.equations, self.reduced
-        if equations is not None and reduced is not None and self._stale(equations):
-            self._linearise(equations.columns, reduced)
+        if self.equations is not None and self._stale(self.equations):
+            self._linearise(self.equations.columns)
         problem = replace(self.problem, ground=self.moving.ground(self.found))
-        return ModelFit(problem, self.found, self.equations, self.coefficients, self.y,
-                        self.reduced)
+        return ModelFit(problem, self.found, self.equations, self.coefficients, self.y)
 
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
@@ -459,7 +440,7 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
     problem = replace(problem, system=other, places=None, residuals_xy=None,
                       conditions=replace(problem.conditions, slopes=flat))
-    refitted = replace(model, problem=problem, found=fit(problem, model.y), reduced=None)
+    refitted = replace(model, problem=problem, found=fit(problem, model.y))
     if model.equations is None:
         return refitted
     weighted = np.isfinite(refitted.found.xy.sigma)

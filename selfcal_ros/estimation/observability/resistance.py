@@ -425,7 +425,7 @@ def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
         kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)
         best = min(((effect(step, line), step) for step in steps), default=None,
-                   key=lambda item: item[0])
+                   key=lambda item: float(f"{item[0]:.9g}"))  # the first of equal ones
         out[line.quantity, line.component] = (
             Removal(CERTIFICATE) if best is None or best[0] > REMOVED * now else
             Removal(kind, best[1], line.effect_rms * best[0] / now))

@@ -288,7 +288,7 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     fields = reduced.free - grid.response @ parameters
     if model.equations is None:
         return fields, parameters, np.zeros((0, len(noise)))
-    now = equations_of(problem, found, model.equations.columns, model.reduced)
+    now = equations_of(problem, found, model.equations.columns)
     columns = now.columns.grid.reshape(now.n, -1)
     right = np.zeros((now.n, len(noise)))
     for draw, one in enumerate(noise):

@@ -108,19 +108,6 @@ class Shapes:
         """Return some of the columns, bool (p,); the shapes are the same."""
         return replace(self, of_column=self.of_column[columns], unit=self.unit[columns])
 
-    def replaced(self, shapes: Sequence[int], means: Sequence[Mapping[int, np.ndarray]]
-                 ) -> "Shapes":
-        """Return the columns with new values of some shapes, in their views."""
-        values = list(self.values)
-        for view, rows in enumerate(self.rows):
-            at = [(np.flatnonzero(rows == shape), mean[view])
-                  for shape, mean in zip(shapes, means, strict=True) if view in mean]
-            if at:
-                values[view] = values[view].copy()
-            for place, mine in at:
-                values[view][place] = mine
-        return replace(self, values=tuple(values))
-
 
 @dataclass(frozen=True, eq=False)
 class LineColumns:
@@ -203,35 +190,23 @@ def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shap
     shapes : Shapes
         Those at the means, and the columns.
     """
-    n = len(shapes.unit)
-    dof = sum(2 * (len(view.mark) - len(np.unique(view.mark)))
-              for view in visits if view is not None and view.repeated)
-    nothing = WithinMarks(np.zeros((n, n)), np.zeros(n), squares_within(visits), dof)
-    return within_anew(visits, at, shapes, before=nothing, changed=np.arange(shapes.n))
-
-
-def within_anew(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes, *,
-                before: WithinMarks, changed: np.ndarray) -> WithinMarks:
-    """Return the same, with the products of the shapes `changed` recomputed."""
     n_marks = shapes.lattice[0] * shapes.lattice[1]
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)
+    dof = 0
     for view, seen in enumerate(visits):
-        mine = [k for k in changed if view in at[k]]
-        if seen is None or not (seen.repeated and mine):
+        if seen is None or not seen.repeated:
             continue
-        here = [k for k in range(shapes.n) if view in at[k]]
-        # about the means of their marks: then those of the others drop out
-        moved = seen.about_means(np.array([at[k][view] for k in mine]), n_marks)
-        weighted = np.conj(moved) * seen.weight
-        inner[np.ix_(mine, here)] += weighted @ np.array([at[k][view] for k in here]).T
-        against[mine] += (weighted @ seen.y).conj()
-    gram, right, own = before.gram.copy(), before.right.copy(), np.isin(shapes.of_column, changed)
-    gram[own], right[own] = shapes.products(inner)[own], shapes.against(against)[own]
-    gram[:, own] = gram[own].T
-    square = gram[np.ix_(own, own)]
-    gram[np.ix_(own, own)] = (square + square.T) / 2
-    return WithinMarks(gram, right, before.total, before.dof)
+        dof += 2 * (len(seen.mark) - len(np.unique(seen.mark)))
+        here = [number for number, values in enumerate(at) if view in values]
+        if here:
+            values = np.array([at[number][view] for number in here])
+            # about the means of their marks: then those of the others drop out
+            weighted = np.conj(seen.about_means(values, n_marks)) * seen.weight
+            inner[np.ix_(here, here)] += weighted @ values.T
+            against[here] += (weighted @ seen.y).conj()
+    gram = shapes.products(inner)
+    return WithinMarks((gram + gram.T) / 2, shapes.against(against), squares_within(visits), dof)
 
 
 @dataclass(frozen=True)
@@ -381,38 +356,6 @@ def term_columns(ground: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
     made = ColumnBuilder(ground)
     made.add_terms(terms)
     return made.done()
-
-
-def made_anew(ground: TermInputs, term: ModelTerm | None, before: TermColumns, *,
-              moved: bool = False) -> TermColumns:
-    """Return columns of which those of one shared term of the visits are of another ground.
-
-    Parameters
-    ----------
-    ground : TermInputs
-        With other offsets or signs of approach.
-    term : ModelTerm, optional
-        One that all views share: its columns are made anew.
-    before : TermColumns
-        Columns of all terms.
-    moved : bool
-        Whether visits differ from the means of their marks otherwise than before.
-    """
-    fresh, at = ColumnBuilder(ground), list(before.at)
-    own: dict[int, int] = {}
-    if term is not None:
-        fresh.add_terms([term])
-        changed = before.shapes.of_column[before.rows([term.name])]
-        # the shape of each new column takes the place of that of the same column before
-        own = dict(zip(fresh.of_column, changed.tolist(), strict=True))
-    for shape, number in own.items():
-        at[number] = fresh.at[shape]
-    shapes = before.shapes.replaced(list(own.values()), [fresh.means[shape] for shape in own])
-    changed = np.arange(shapes.n) if moved else np.array(sorted(own.values()), dtype=int)
-    total = squares_within(ground.visits) if moved else before.within.total
-    within = within_anew(ground.visits, at, shapes, before=replace(before.within, total=total),
-                         changed=changed)
-    return TermColumns(before.columns, shapes, within, at, before.lines)
 
 
 def _require_visits(ground: TermInputs, name: str) -> None:

@@ -18,7 +18,7 @@ readings give another size: that at which b' (C + size^2 1)^-1 b equals its rank
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import chdtri, fdtrc
@@ -76,37 +76,13 @@ class ReducedColumns:
         return self.shapes.products(self.inner)
 
 
+@lru_cache(maxsize=2)
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
-    """Return columns with the sites eliminated."""
+    """Return columns with the sites eliminated; the last ones are kept."""
     sites, inner, asked = _marks_eliminated(grid, shapes)
     inner -= grid.factor.products(sites)
     return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
                           asked - _coupled(grid, sites))
-
-
-def reduce_anew(grid: GridSystem, shapes: Shapes, before: ReducedColumns,
-                rows: np.ndarray) -> ReducedColumns:
-    """Return columns with the sites eliminated, if only `rows` have changed.
-
-    Parameters
-    ----------
-    grid : GridSystem
-        The measured plan.
-    shapes : Shapes
-        The columns.
-    before : ReducedColumns
-        The previous columns.
-    rows : bool array (p,)
-        Columns to recompute, with all others of the same shapes.
-    """
-    changed = np.unique(shapes.of_column[rows])
-    sites, fresh, asked = _marks_eliminated(grid, shapes)
-    free = grid.factor.solve(np.ascontiguousarray(sites[:, changed]))
-    inner, asked_before = before.inner.copy(), before.asked.copy()
-    inner[changed] = fresh[changed] - free.conj().T @ sites
-    inner[:, changed] = inner[changed].conj().T
-    asked_before[:, changed] = asked[:, changed] - _coupled(grid, sites[:, changed])
-    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2, asked_before)
 
 
 def _marks_eliminated(grid: GridSystem, shapes: Shapes
@@ -457,8 +433,7 @@ class TermEquations:
 
 
 def equations_of_columns(system: NormalEquations, columns: TermColumns, inverse: np.ndarray, *,
-                         ratio: float, half_width_m: float, noise_m: float,
-                         reduced: ReducedColumns | None = None) -> TermEquations:
+                         ratio: float, half_width_m: float, noise_m: float) -> TermEquations:
     """Return the equations of columns of readings that are planned, or about an estimate.
 
     Parameters
@@ -471,11 +446,8 @@ def equations_of_columns(system: NormalEquations, columns: TermColumns, inverse:
         Weight of a line, and the unit of the misalignments, m.
     noise_m : float
         Noise of one grid reading, m; 0 if unknown.
-    reduced : ReducedColumns, optional
-        The columns with the sites eliminated, if that is done.
     """
-    if reduced is None:
-        reduced = reduce_columns(system.grid, columns.shapes)
+    reduced = reduce_columns(system.grid, columns.shapes)
     projected = project(system, reduced, inverse, columns.lines, ratio=ratio,
                         half_width_m=half_width_m)
     return TermEquations(system, columns, projected, noise_m, ratio * half_width_m**2)

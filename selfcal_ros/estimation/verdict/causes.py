@@ -659,7 +659,7 @@ def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = Tru
     """Return a term of the model with its fitted coefficients and its effect."""
     if model.equations is None:
         raise ValueError(f"the model does not have the term {name}")
-    equations = equations_of(model.problem, model.found, model.equations.columns, model.reduced)
+    equations = equations_of(model.problem, model.found, model.equations.columns)
     rows = equations.rows([name])
     covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
     columns = tuple(compress(equations.columns.columns, rows))

@@ -31,7 +31,7 @@ def test_the_larger_of_two_noises_that_contradict_each_other_counts(ratio, large
 
 
 @pytest.mark.parametrize(("dof", "counts"), [
-    (1e-13, False), (0.49, False), (0.51, True), (2, True)])
+    (1e-13, False), (0.99, False), (1.01, True), (2, True)])
 def test_residuals_without_degrees_of_freedom_contradict_nothing(dof, counts):
     """Terms with sizes leave a fraction of one, in which there is rounding alone."""
     found = noise_estimate((8e-7, 48), (2e-12, dof), NAN)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the estimate leaves of columns, and makes of them: as one dense least squares has it."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_of
 from selfcal_ros.estimation.terms.equations import (
     project,
-    reduce_anew,
     reduce_columns,
 )
 from selfcal_ros.model.pose import LatticePose
@@ -89,17 +87,3 @@ def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(sy
         rest = system.gauge.remove(moved.reshape(SHAPE), system.gauge.parts(
             moved.reshape(SHAPE)))
         assert np.abs(rest[system.known_sites]).max() < 1e-9
-
-
-@pytest.mark.parametrize("changed", [[0, 1], [2], [3, 4], [5]])
-def test_columns_that_change_are_set_up_anew_with_those_of_the_same_shape(system, shapes, changed):
-    rng = np.random.default_rng(5)
-    at = sorted({OF_COLUMN[column] for column in changed})
-    before = replace(shapes, values=tuple(
-        np.where(np.isin(rows, at)[:, None], rng.normal(size=values.shape), values)
-        for rows, values in zip(shapes.rows, shapes.values, strict=True)))
-    again = reduce_anew(system.grid, shapes, reduce_columns(system.grid, before),
-                        np.isin(np.arange(len(UNIT)), changed))
-    wanted = reduce_columns(system.grid, shapes)
-    for name in ("free", "right", "gram"):
-        assert getattr(again, name) == pytest.approx(getattr(wanted, name), abs=1e-10)

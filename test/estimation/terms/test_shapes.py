@@ -62,13 +62,3 @@ def test_some_columns_are_the_same_columns(made):
     shapes, full = made
     some = np.array([True, False, True, True, False, True, False])
     assert np.array_equal(shapes.part(some).grid, full[some])
-
-
-def test_shapes_change_in_the_views_that_they_have_and_only_there(made):
-    shapes, full = made
-    fresh = drawn(7, MARKS)
-    changed = shapes.replaced([2, 0], [{0: fresh}, {}])
-    wanted = full.copy()
-    wanted[3, 0], wanted[4, 0] = (unit * fresh.reshape(LATTICE) for unit in (1, 1j))
-    assert np.array_equal(changed.grid, wanted)
-    assert np.array_equal(shapes.grid, full)
