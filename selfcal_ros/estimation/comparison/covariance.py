@@ -181,8 +181,9 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
     grid, lines = [], []
     for index, v in enumerate(result.views):
         in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"
-        pose = pose_of(View(v.name, v.rotation, (v.translation_x, v.translation_y), in_grid,
-                            _is_read(v.read_angular)), artifact)
+        view = View(v.name, v.rotation, (v.translation_x, v.translation_y), in_grid,
+                    _is_read(v.read_angular))
+        pose = pose_of(view, artifact)
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
         if weight.any():
@@ -190,7 +191,7 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
             turned *= artifact.angular_count / (2 * np.pi)
             lines.append((index, (pose.turn_lines or 0) + turned, weight))
         if in_grid:
-            grid.append((index, pose, _weights(v.read_grid, in_field(pose, artifact), of_grid)))
+            grid.append((index, pose, _weights(v.read_grid, in_field(view, artifact), of_grid)))
     angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
                                                                 artifact.angular_count)
     return system_of(

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
-from selfcal_ros.estimation.joint.problem import F_LEVEL
+from selfcal_ros.estimation.joint.problem import F_LEVEL, NEGLIGIBLE
 from selfcal_ros.estimation.normal.angular import MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.observability.rank import DETERMINED
@@ -29,9 +29,6 @@ from selfcal_ros.model.view import View
 POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
 """Powers (a, b) of z^a conj(z)^b that each degree adds; radial distortion is z^2 conj(z). The other
 cubic ones look like linear ones in three cells."""
-
-IN_LINE = 3e-3
-"""Least part of a polynomial that places must show, of that of its largest part."""
 
 STEP_M = 1e-6
 """Half the distance over which the slope of the distortion is taken, small in any camera."""
@@ -250,7 +247,7 @@ def _unit_terms(place: np.ndarray, powers: Powers) -> np.ndarray:
 def _determined(place: np.ndarray, powers: Powers) -> bool:
     """Return whether a polynomial follows from its values at places, not all near one line."""
     sizes = np.linalg.svd(_unit_terms(place, powers), compute_uv=False)
-    return bool(len(sizes) > len(powers) and sizes[-1] > IN_LINE * sizes[0])
+    return bool(len(sizes) > len(powers) and sizes[-1] > NEGLIGIBLE * sizes[0])
 
 
 def _place(views: Sequence[ViewReadings]) -> complex:

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import ceil
+from typing import cast
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -415,8 +416,8 @@ class PlacedViews(LatticeViews):
 
 def by_kind(poses: tuple[AnyPose, ...]) -> tuple[tuple[LatticePose, ...], tuple[MapPose, ...]]:
     """Return the poses on the lattice, and those of a map with nodes of its own: all are of one."""
-    return (tuple(pose for pose in poses if isinstance(pose, LatticePose)),
-            tuple(pose for pose in poses if isinstance(pose, MapPose)))
+    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
+    return cast(tuple[LatticePose, ...], () if placed else poses), placed
 
 
 def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> LatticeViews:

@@ -71,11 +71,9 @@ def pose_of(view: View, artifact: Artifact) -> AnyPose:
     return MapPose(artifact, pose) if isinstance(pose, PlacedPose) else view.lattice_pose(artifact)
 
 
-def in_field(pose: AnyPose, artifact: Artifact) -> np.ndarray:
+def in_field(view: View, artifact: Artifact) -> np.ndarray:
     """Return the marks of a view that lie in the field, bool (nx, ny)."""
-    if isinstance(pose, MapPose):
-        return pose.in_field
-    places = artifact.places(artifact.m, artifact.n)
+    pose, places = view.on_stage(artifact), artifact.places(artifact.m, artifact.n)
     return ~pose.beyond_field(np.stack(pose.site_of(*places)), artifact)
 
 
@@ -139,7 +137,7 @@ def grid_data(measurements: Measurements) -> GridData:
         readings = measurements.views[i]
         pose = _grid_pose(readings, artifact)
         where = f"view '{readings.view.name}' grid readings"
-        flat = _flat_marks(readings, artifact, pose, where=where)
+        flat = _flat_marks(readings, artifact, where=where)
         if not len(readings.dx) == len(readings.dy) == len(flat):
             raise InputError(where, "marks and deviations differ in length",
                              "give one value a mark")
@@ -186,15 +184,14 @@ def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
     return pose_of(readings.view, artifact)
 
 
-def _flat_marks(readings: ViewReadings, artifact: Artifact, pose: AnyPose, *,
-                where: str) -> np.ndarray:
+def _flat_marks(readings: ViewReadings, artifact: Artifact, *, where: str) -> np.ndarray:
     """Return the flat index of every mark read, checked for plate and field."""
     m, n = np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
         raise InputError(where, "m and n differ in length", "give one value a mark")
     off_plate = ~artifact.has(m, n)
     flat = np.where(off_plate, 0, artifact.flat(m, n))
-    off_field = ~in_field(pose, artifact).reshape(-1)[flat]
+    off_field = ~in_field(readings.view, artifact).reshape(-1)[flat]
     for name, bad in (("off the plate", off_plate), ("off the stage's field", off_field)):
         if bad.any():
             k = int(np.argmax(bad))

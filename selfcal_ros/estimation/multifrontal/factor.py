@@ -325,10 +325,6 @@ def _best_cut(at: np.ndarray, reach: int) -> int:
     return int(starts[np.argmin(np.maximum(left, right))] + at.min())
 
 
-SMALL = 64
-"""Largest side of a triangle inverted by substitution."""
-
-
 class Factor:
     """Factorised Hermitian positive definite matrix over the sites of a field.
 
@@ -544,10 +540,10 @@ def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
 def _inverse(lower: np.ndarray) -> np.ndarray:
     """Return the inverse of a lower triangular matrix, which is overwritten.
 
-    Recursive by halves: matrix products are faster than substitution.
+    Recursive by halves: matrix products are faster than substitution, but for a small one.
     """
     n = len(lower)
-    if n <= SMALL:
+    if 3 * n <= LEAF:
         return lapack.dtrtri(lower, lower=1, overwrite_c=1)[0]
     half = n // 2
     first = _inverse(np.asfortranarray(lower[:half, :half]))

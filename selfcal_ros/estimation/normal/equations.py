@@ -698,7 +698,7 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
     poses = tuple(pose_of(view, artifact) for _, view in grid_views)
     angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
     turns = tuple(pose_of(v, artifact).turn_lines or 0 for _, v in angular)
-    field = np.array([in_field(pose, artifact) for pose in poses])
+    field = np.array([in_field(view, artifact) for _, view in grid_views])
     weight = field.reshape(len(poses), *artifact.shape) * np.array(
         [v.repeats for _, v in grid_views], dtype=float)[:, None, None]
     lines = np.array([v.repeats for _, v in angular], dtype=float)

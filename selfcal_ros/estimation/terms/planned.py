@@ -34,9 +34,6 @@ from selfcal_ros.model.view import (
 )
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
-SEED = 1
-"""Seed of the stop errors and random visiting orders assumed for a plan."""
-
 SPREAD = ((0.56, 0.0941), (0.40, 0.0741), (0.48, 0.4291))
 """First quantile and step of rotation and position along x and y from view to view. They are the
 same in a view whatever views come after it. What the microscope costs depends on them by a factor
@@ -93,8 +90,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     assumed : Assumed
         Visiting order and stop errors.
     """
-    rng = np.random.default_rng(SEED)
-    x, y = assumed.error_m * np.random.default_rng([SEED, 1]).normal(size=(2, 2, *artifact.shape))
+    rng = np.random.default_rng(1)
+    x, y = assumed.error_m * np.random.default_rng([1, 1]).normal(size=(2, 2, *artifact.shape))
     errors = x + 1j * y
     views = with_sub_views(views)
     grid_views = [views[i] for i in system.grid_index]
