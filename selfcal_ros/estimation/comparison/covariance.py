@@ -196,7 +196,8 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
                                                                 artifact.angular_count)
     return system_of(
         Marks(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid]),
-              tuple(index for index, *_ in grid), rotations=kept_rotations(result, len(grid))),
+              tuple(index for index, *_ in grid), rotations=kept_rotations(result, len(grid)),
+              plate=artifact.placed),
         Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines),
               artifact.harmonics))
 

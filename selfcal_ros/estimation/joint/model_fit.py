@@ -402,7 +402,7 @@ def is_untested(problem: Problem) -> bool:
     views, left = system.grid.views, equations_left(system.grid)
     if views.spline.axes[0].degree == 1 or left > 2 * math.prod(views.spline.refined.shape):
         return False
-    fine = PlacedSystem(views.poses, system.grid.weight, views.spline.refined)
+    fine = PlacedSystem(views.artifact, views.poses, system.grid.weight, views.spline.refined)
     return left - told_coefficients(PlacedEquations(
         fine, system.angular, system.grid_index, system.angular_index)) < 1
 
@@ -435,7 +435,8 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     if system is None:
         return None
     grid = system.grid
-    other = FinerEquations(PlacedSystem(grid.views.poses, grid.weight, spline, grid.rotations),
+    other = FinerEquations(PlacedSystem(grid.views.artifact, grid.views.poses, grid.weight, spline,
+                                        grid.rotations),
                            system.angular, system.grid_index, system.angular_index)
     flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
     problem = replace(problem, system=other, places=None, residuals_xy=None,

@@ -29,9 +29,9 @@ from typing import cast
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from selfcal_ros.estimation.lattice.readings import AnyPose, MapPose
+from selfcal_ros.estimation.lattice.readings import GridData
 from selfcal_ros.model.artifact import Artifact, Interpolation
-from selfcal_ros.model.pose import EDGE, LatticePose
+from selfcal_ros.model.pose import EDGE, LatticePose, PlacedPose
 
 PHASES = np.array([1, 1j, -1, -1j])
 """i^q for q = 0..3, exact."""
@@ -341,16 +341,18 @@ class PlacedViews(LatticeViews):
 
     Parameters
     ----------
-    poses : tuple of MapPose
-        One per view, all of one plate.
+    plate : Artifact
+        The plate, with the grid of the map.
+    poses : tuple of PlacedPose
+        One per view.
     spline : MapSpline, optional
         Of the map; by default the one through its nodes.
     """
 
-    poses: tuple[MapPose, ...]  # type: ignore[assignment]
+    poses: tuple[PlacedPose, ...]  # type: ignore[assignment]
 
-    def __init__(self, poses: tuple[MapPose, ...], spline: MapSpline | None = None) -> None:
-        artifact = poses[0].artifact
+    def __init__(self, artifact: Artifact, poses: tuple[PlacedPose, ...],
+                 spline: MapSpline | None = None) -> None:
         grid = artifact.map_grid
         self.poses, self.artifact = poses, artifact
         self.spline = spline or MapSpline.of(
@@ -371,17 +373,25 @@ class PlacedViews(LatticeViews):
         """Node positions in the unit, complex (cx, cy)."""
         return self.spline.places_m / (self.unit * self.artifact.grid_pitch_m)
 
+    @property
+    def sites(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Nominal places of the marks in each view, pitches of the plate, (nx, ny) each."""
+        places = self.artifact.places(self.artifact.m, self.artifact.n)
+        return [pose.site_of(*places) for pose in self.poses]
+
     @cached_property
     def in_field(self) -> np.ndarray:
         """Marks inside the field, bool (views, nx, ny)."""
-        return np.array([pose.in_field for pose in self.poses])
+        return np.array([~pose.beyond_field(np.stack(sites), self.artifact) for pose, sites in zip(
+            self.poses, self.sites, strict=True)])
 
     @cached_property
     def rows(self) -> tuple[csr_matrix, ...]:
         """Rows of each view's marks on the spline's coefficients, real (marks, nodes); 0 off it."""
         pitch_m = self.artifact.grid_pitch_m
         return tuple(self.spline.rows((x + 1j * y).ravel() * pitch_m).multiply(
-            pose.in_field.reshape(-1, 1)).tocsr() for pose in self.poses for x, y in [pose.sites])
+            inside.reshape(-1, 1)).tocsr() for inside, (x, y) in zip(
+                self.in_field, self.sites, strict=True))
 
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return e^(-i alpha) G(X_v(m)), complex (..., views, nx, ny); 0 off the field."""
@@ -414,13 +424,8 @@ class PlacedViews(LatticeViews):
                                 & nodes[i + 1, j + 1])
 
 
-def by_kind(poses: tuple[AnyPose, ...]) -> tuple[tuple[LatticePose, ...], tuple[MapPose, ...]]:
-    """Return the poses on the lattice, and those of a map with nodes of its own: all are of one."""
-    placed = tuple(pose for pose in poses if isinstance(pose, MapPose))
-    return cast(tuple[LatticePose, ...], () if placed else poses), placed
-
-
-def maps_of(shape: tuple[int, int], poses: tuple[AnyPose, ...]) -> LatticeViews:
-    """Return the maps of views of a plate with `shape` marks."""
-    lattice, placed = by_kind(poses)
-    return PlacedViews(placed) if placed else LatticeViews(shape, lattice)
+def maps_of(grid: GridData) -> LatticeViews:
+    """Return the maps of the views of readings."""
+    if grid.plate is None:
+        return LatticeViews(grid.y.shape[1:], cast(tuple[LatticePose, ...], grid.poses))
+    return PlacedViews(grid.plate, cast(tuple[PlacedPose, ...], grid.poses))

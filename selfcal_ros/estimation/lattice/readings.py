@@ -2,7 +2,8 @@
 """Readings on the lattice, in a canonical form that does not depend on their order; view poses."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import cast
 
 import numpy as np
 
@@ -12,50 +13,7 @@ from selfcal_ros.model.pose import LatticePose, PlacedPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View, rotations_of
 
-
-@dataclass(frozen=True)
-class MapPose:
-    """The pose of a view together with the plate and the grid of the map.
-
-    Attributes
-    ----------
-    artifact : Artifact
-        The plate, with `map_grid`.
-    pose : PlacedPose
-        Where it lies.
-    """
-
-    artifact: Artifact
-    pose: PlacedPose
-
-    @property
-    def phase(self) -> complex:
-        """exp(i turn): the factor from the plate frame to the stage frame."""
-        return self.pose.phase
-
-    @property
-    def shift(self) -> tuple[float, float]:
-        """Position of the plate's centre along stage x and y, pitches."""
-        return self.pose.shift
-
-    @property
-    def turn_lines(self) -> float | None:
-        """Its turn in angular lines; None between two of them, unless the map is a series."""
-        return self.pose.turn_lines
-
-    @cached_property
-    def sites(self) -> np.ndarray:
-        """Nominal places of the marks, (2, nx, ny), pitches of the plate."""
-        artifact = self.artifact
-        return np.stack(self.pose.site_of(*artifact.places(artifact.m, artifact.n)))
-
-    @cached_property
-    def in_field(self) -> np.ndarray:
-        """Marks in the stage's field, bool (nx, ny)."""
-        return ~self.pose.beyond_field(self.sites, self.artifact)
-
-
-AnyPose = LatticePose | MapPose
+AnyPose = LatticePose | PlacedPose
 
 
 @lru_cache(maxsize=1024)
@@ -67,13 +25,12 @@ def pose_of(view: View, artifact: Artifact) -> AnyPose:
     InputError
         As `View.on_stage`.
     """
-    pose = view.on_stage(artifact)
-    return MapPose(artifact, pose) if isinstance(pose, PlacedPose) else view.lattice_pose(artifact)
+    return cast(AnyPose, view.on_stage(artifact))
 
 
 def in_field(view: View, artifact: Artifact) -> np.ndarray:
     """Return the marks of a view that lie in the field, bool (nx, ny)."""
-    pose, places = view.on_stage(artifact), artifact.places(artifact.m, artifact.n)
+    pose, places = pose_of(view, artifact), artifact.places(artifact.m, artifact.n)
     return ~pose.beyond_field(np.stack(pose.site_of(*places)), artifact)
 
 
@@ -85,8 +42,10 @@ class GridData:
     ----------
     index : tuple of int
         Position in `Measurements.views` of every grid view.
-    poses : tuple of LatticePose or MapPose
+    poses : tuple of LatticePose or PlacedPose
         Their poses.
+    plate : Artifact, optional
+        The plate, if the map has nodes of its own.
     y : complex array (views, nx, ny)
         Deviations turned into the plate frame, m; 0 where not read.
     weight : float array (views, nx, ny)
@@ -99,6 +58,7 @@ class GridData:
 
     index: tuple[int, ...]
     poses: tuple[AnyPose, ...]
+    plate: Artifact | None
     y: np.ndarray
     weight: np.ndarray
     sigma_declared: float
@@ -149,7 +109,7 @@ def grid_data(measurements: Measurements) -> GridData:
         ones.append((flat, readings.count, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
-    return GridData(index, tuple(poses), y, weight, sigma,
+    return GridData(index, tuple(poses), artifact.placed, y, weight, sigma,
                     rotations_of([measurements.views[i].view for i in index]))
 
 

@@ -12,6 +12,7 @@ Equations are made once for each plan, planned or measured, and kept.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,12 +21,11 @@ from scipy.sparse import csr_matrix, diags
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
-from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews, by_kind
+from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews
 from selfcal_ros.estimation.lattice.readings import (
     AngularData,
     AnyPose,
     GridData,
-    MapPose,
     in_field,
     pose_of,
 )
@@ -40,6 +40,7 @@ from selfcal_ros.estimation.normal.angular import (
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.pose import LatticePose, PlacedPose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
 TRACE = 1e-6
@@ -432,7 +433,9 @@ class PlacedSystem(GridSystem):
 
     Parameters
     ----------
-    poses : tuple of MapPose
+    plate : Artifact
+        The plate, with the grid of the map.
+    poses : tuple of PlacedPose
         One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
@@ -449,11 +452,11 @@ class PlacedSystem(GridSystem):
 
     views: PlacedViews
 
-    def __init__(self, poses: tuple[MapPose, ...], weight: np.ndarray,
+    def __init__(self, plate: Artifact, poses: tuple[PlacedPose, ...], weight: np.ndarray,
                  spline: MapSpline | None = None, rotations: tuple[int, ...] = (), *,
                  known_plate: bool = False) -> None:
         super().__init__((), weight, rotations=rotations, known_plate=known_plate)
-        self.views = PlacedViews(poses, spline)
+        self.views = PlacedViews(plate, poses, spline)
 
     @cached_property
     def components(self) -> Components:
@@ -624,6 +627,8 @@ class Marks[Pose]:
         Of the map, if it is a Fourier series.
     rotations, known_plate
         As of `GridSystem`.
+    plate : Artifact, optional
+        The plate, if the map has nodes of its own.
     """
 
     poses: tuple[Pose, ...]
@@ -632,11 +637,12 @@ class Marks[Pose]:
     harmonics: int = 0
     rotations: tuple[int, ...] = ()
     known_plate: bool = False
+    plate: Artifact | None = None
 
     @cached_property
     def _key(self) -> tuple:
-        return (self.poses, self.index, self.harmonics, self.rotations, self.known_plate,
-                self.weight.shape, self.weight.tobytes())
+        return (self.plate, self.poses, self.index, self.harmonics, self.rotations,
+                self.known_plate, self.weight.shape, self.weight.tobytes())
 
     def __hash__(self) -> int:
         """Return that of all that the equations depend on."""
@@ -649,7 +655,8 @@ class Marks[Pose]:
 
 def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
     """Return the system of a measured plan, from the cache if the same marks were read."""
-    return system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations),
+    return system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations,
+                           plate=grid.plate),
                      Marks(angular.turns, angular.weight, angular.index, angular.harmonics))
 
 
@@ -662,11 +669,12 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
 def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
                rank_only: bool = False) -> NormalEquations:
     lines = lines_of(angular)
-    poses, placed = by_kind(grid.poses)
-    if placed:
+    if grid.plate is not None:
         return PlacedEquations(
-            PlacedSystem(placed, grid.weight, rotations=grid.rotations,
-                         known_plate=grid.known_plate), lines, grid.index, angular.index)
+            PlacedSystem(grid.plate, cast(tuple[PlacedPose, ...], grid.poses), grid.weight,
+                         rotations=grid.rotations, known_plate=grid.known_plate),
+            lines, grid.index, angular.index)
+    poses = cast(tuple[LatticePose, ...], grid.poses)
     return NormalEquations(
         GridSystem(poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate),
         lines, grid.index, angular.index, rank_only=rank_only)
@@ -704,7 +712,7 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
     lines = np.array([v.repeats for _, v in angular], dtype=float)
     return _equations(
         Marks(poses, weight, tuple(i for i, _ in grid_views),
-              rotations=rotations_of([view for _, view in grid_views])),
+              rotations=rotations_of([view for _, view in grid_views]), plate=artifact.placed),
         Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
               tuple(i for i, _ in angular), artifact.harmonics), rank_only=rank_only)
 

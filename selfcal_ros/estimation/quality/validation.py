@@ -154,7 +154,7 @@ def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
     """
     model, result = solved.joint, solved.result
     problem, system = model.problem, model.problem.system
-    views = maps_of(system.grid.views.plate_shape, held.grid.poses)
+    views = maps_of(held.grid)
     known = (held.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
     plate, marks = model.found.plate, views.z * problem.half_width_m
     error = held.grid.y - held.moved - np.tensordot(model.coefficients, held.columns, axes=1)
@@ -243,7 +243,7 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own = noise_of(rng, (n, *weight.shape), weight)
     own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
-    views = maps_of(grid.views.plate_shape, held.grid.poses)
+    views = maps_of(held.grid)
     squares = np.zeros(n)
     step = max(TOGETHER // grid.weight.size, 1)
     for draws in (slice(first, first + step) for first in range(0, n, step)):

@@ -224,7 +224,7 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
     system = system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations,
-                             known_plate=True), Marks((), angular.weight[:0], ()))
+                             known_plate=True, plate=grid.plate), Marks((), angular.weight[:0], ()))
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))

@@ -15,13 +15,10 @@ import numpy as np
 from selfcal_ros.compensation.cells import Cells, bicubic_cells, bilinear_cells
 from selfcal_ros.estimation.lattice.maps import LatticeViews, maps_of
 from selfcal_ros.estimation.lattice.readings import GridData
+from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Measurements
-
-AT_SITES = 1e-5
-"""Distance from the sites, in pitches, at which the stage stands at them: even where its error is a
-micrometre, it is 10 pm off there."""
 
 STEP = 1e-3
 """Half the distance, in pitches, over which slopes are taken."""
@@ -190,7 +187,7 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
     known : bool array (nx, ny)
         Sites whose error is known.
     """
-    views = maps_of(grid.y.shape[1:], grid.poses)
+    views = maps_of(grid)
     away = np.zeros(grid.y.shape, dtype=complex)
     located = np.zeros(away.shape, dtype=bool)
     marks: list[np.ndarray | None] = []
@@ -208,7 +205,7 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
         about.append(stood - mean[visits.mark])
     located &= views.near(known) & (grid.weight > 0)
     pitch_m = ground.half_width_m / views.unit * views.node_pitch
-    if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
+    if not np.abs(away[located]).max(initial=0.0) > TRACE * pitch_m:
         return None
     return StagePlaces(views, pitch_m, known, np.nonzero(located), away[located], tuple(marks),
                        tuple(about))

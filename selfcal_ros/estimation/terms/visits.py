@@ -337,7 +337,7 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
     """Return the ground of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
-    z = maps_of(grid.y.shape[1:], grid.poses).z
+    z = maps_of(grid).z
     readings = [measurements.views[i] for i in grid.index]
     views = [view.view for view in readings]
     placings = placings_of(views)

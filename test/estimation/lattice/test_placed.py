@@ -15,7 +15,7 @@ CELLS = {"bilinear": bilinear_cells, "bicubic": bicubic_cells}
 
 
 def views_of(artifact: Artifact, poses) -> PlacedViews:
-    return PlacedViews(tuple(pose_of(View("", np.radians(turn), tuple(
+    return PlacedViews(artifact, tuple(pose_of(View("", np.radians(turn), tuple(
         step * artifact.grid_pitch_m for step in shift)), artifact) for turn, shift in poses))
 
 
