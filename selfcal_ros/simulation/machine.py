@@ -14,8 +14,6 @@ from selfcal_ros.model.view import View
 
 WALK_STEPS = 256
 """Steps of a random walk from the first grid exposure of a view to the last."""
-ENCODERS = ("independent", "xy_axes")
-ROTATIONS = ("finite", "linear")
 AXES = {"xy": (1, 0, 0, 1), "-x-y": (-1, 0, 0, -1), "-xy": (-1, 0, 0, 1), "x-y": (1, 0, 0, -1),
         "yx": (0, 1, 1, 0), "-y-x": (0, -1, -1, 0), "y-x": (0, 1, -1, 0), "-yx": (0, -1, 1, 0)}
 """Published x and y of an offset from its true x and y: rows of a matrix, consecutively."""
