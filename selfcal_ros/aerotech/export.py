@@ -55,10 +55,14 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     pitch = artifact.grid_pitch_m / unit_m
     corrections = np.stack([frame.sign_x * error_map.gx.T, frame.sign_y * error_map.gy.T], axis=-1)
     return Table2D(
-        frame.y_axis, frame.x_axis, (frame.x_axis, frame.y_axis), tidy(frame.sign_y * pitch),
-        tidy(frame.sign_x * pitch), np.round(corrections / M_PER_UM, DECIMALS), PRIMARY,
-        micrometres(unit_m), tidy(frame.sign_y * (hy + frame.home_y_m) / unit_m),
-        tidy(frame.sign_x * (hx + frame.home_x_m) / unit_m))
+        frame.y_axis, frame.x_axis, (frame.x_axis, frame.y_axis),
+        sample_row=tidy(frame.sign_y * pitch),
+        sample_col=tidy(frame.sign_x * pitch),
+        values=np.round(corrections / M_PER_UM, DECIMALS),
+        pos_unit=PRIMARY,
+        cor_unit=micrometres(unit_m),
+        offset_row=tidy(frame.sign_y * (hy + frame.home_y_m) / unit_m),
+        offset_col=tidy(frame.sign_x * (hx + frame.home_x_m) / unit_m))
 
 
 def theta_decimals(error_map: ErrorMap) -> int:

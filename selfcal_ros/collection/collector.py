@@ -219,15 +219,23 @@ class Collector:
         loose.update({str(reason): count for reason, count in self._rejected_input.items()})
         stamps = [command.stamp_ns for command in self._commands]
         self._seen = DetectionsSeen(
-            self._views.table, self._views.view_of, self._exposures, self._facts,
-            (min(stamps), max(stamps)), timeline.artifact, self._rules.identity, self.sense)
+            self._views.table, self._views.view_of, self._exposures,
+            encoder=self._facts,
+            commands_ns=(min(stamps), max(stamps)),
+            artifact=timeline.artifact,
+            rules=self._rules.identity,
+            sense=self.sense)
         progress = {index: view_progress(timeline, index, found, self._min_repeats)
                     for index, found in readings.items()}
         parts = tuple(part for view in readings.values() for part in view.parts)
-        return Measurements(timeline.plan_id, timeline.artifact, parts, self.sense,
-                            dict(sorted(loose.items())), timeline.run_id,
-                            timeline.model_terms, timeline.artifact_from,
-                            timeline.verify), progress
+        return Measurements(
+            timeline.plan_id, timeline.artifact, parts,
+            sense=self.sense,
+            rejected=dict(sorted(loose.items())),
+            run_id=timeline.run_id,
+            model_terms=timeline.model_terms,
+            artifact_from=timeline.artifact_from,
+            verify=timeline.verify), progress
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, RejectionFinding]:
@@ -279,9 +287,16 @@ def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
     grid, angular = expected_marks(artifact, view)
     done, done_theta = n_read_enough(artifact, view, readings, min_repeats)
     checked = min(max(count_stops(view, part)[1] for part in readings.parts), view.check_marks)
-    return ViewProgress(index, view, grid, done, angular, done_theta,
-                        readings, max(i.end_ns for i in timeline.of_view(index)), artifact,
-                        checked, min_repeats)
+    return ViewProgress(
+        index, view, grid,
+        grid_done=done,
+        angular_expected=angular,
+        angular_done=done_theta,
+        readings=readings,
+        end_ns=max(i.end_ns for i in timeline.of_view(index)),
+        artifact=artifact,
+        check_done=checked,
+        min_repeats=min_repeats)
 
 
 LARGEST_KEPT = 31 * 2**20

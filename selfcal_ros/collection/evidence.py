@@ -187,10 +187,19 @@ class DetectionsSeen:
         came = (*(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
                 *encoder.foreign)
         return Evidence(
-            rejected, used, missing, came, _span(table["stamp"]), encoder.span_ns,
-            self.commands_ns, encoder.step_s, encoder.max_gap_s, tuple(marks.values()),
-            self.artifact.grid_pitch_m, self.rules.stage_limit_m(self.artifact), self.sense, lies,
-            joints)
+            rejected, used, missing,
+            seen_joints=came,
+            detections_ns=_span(table["stamp"]),
+            encoder_ns=encoder.span_ns,
+            commands_ns=self.commands_ns,
+            encoder_step_s=encoder.step_s,
+            max_gap_s=encoder.max_gap_s,
+            marks=tuple(marks.values()),
+            pitch_m=self.artifact.grid_pitch_m,
+            limit_m=self.rules.stage_limit_m(self.artifact),
+            sense=self.sense,
+            lies=lies,
+            joints=joints)
 
     def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
         """Return view_index -> the last of its marks with ids, as `sense` has them."""

@@ -191,10 +191,18 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     unmeasured = {c.view_index: (c.placed().name, interval)
                   for c, run, interval in zip(ordered, runs, intervals, strict=True)
                   if run == run_id and c.phase == Phase.PLACE and c.view_index not in views}
-    return Timeline(plan_id, artifact, dict(sorted(views.items())), intervals, planned,
-                    ordered[-1].phase in (Phase.DONE, Phase.ABORT), ordered[-1].stamp_ns,
-                    run_id if _begin_is_known(mine[0], runs) else "", newest.model_terms, strays,
-                    newest.artifact_from, newest.verify, unmeasured)
+    return Timeline(
+        plan_id, artifact, dict(sorted(views.items())),
+        intervals=intervals,
+        views_planned=planned,
+        finished=ordered[-1].phase in (Phase.DONE, Phase.ABORT),
+        last_stamp_ns=ordered[-1].stamp_ns,
+        run_id=run_id if _begin_is_known(mine[0], runs) else "",
+        model_terms=newest.model_terms,
+        strays=strays,
+        artifact_from=newest.artifact_from,
+        verify=newest.verify,
+        unmeasured=unmeasured)
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:

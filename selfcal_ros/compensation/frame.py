@@ -148,9 +148,13 @@ def _stated(line: str) -> MachineFrame | None:
         counts = words.get("theta-counts-per-unit")
         return MachineFrame(
             int(words["x-axis"]), int(words["y-axis"]), int(theta) if theta else None,
-            words.get("unit", "mm"), float(words.get("home-x", 0)) * unit_m,
-            float(words.get("home-y", 0)) * unit_m,
-            math.radians(float(words.get("home-theta", 0))), "reverse-x" in words,
-            "reverse-y" in words, "reverse-theta" in words, float(counts) if counts else None)
+            unit=words.get("unit", "mm"),
+            home_x_m=float(words.get("home-x", 0)) * unit_m,
+            home_y_m=float(words.get("home-y", 0)) * unit_m,
+            home_theta_rad=math.radians(float(words.get("home-theta", 0))),
+            reverse_x="reverse-x" in words,
+            reverse_y="reverse-y" in words,
+            reverse_theta="reverse-theta" in words,
+            theta_counts_per_unit=float(counts) if counts else None)
     except (KeyError, ValueError):
         return None

@@ -152,11 +152,18 @@ def _map_grid_of(message: Any) -> MapGrid | None:
 
 def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
     """Return the view of a ViewCommand or ViewMeasurement."""
-    return View(str(message.view_name), float(message.rotation),
-                (float(message.translation_x), float(message.translation_y)), grid, angular,
-                repeats, _order_of(message), int(getattr(message, "check_marks", 0)),
-                float(getattr(message, "check_offset", 0.0)), _image_of(message),
-                cell_of(message))
+    return View(
+        str(message.view_name),
+        float(message.rotation),
+        (float(message.translation_x), float(message.translation_y)),
+        grid=grid,
+        angular=angular,
+        repeats=repeats,
+        visit_order=_order_of(message),
+        check_marks=int(getattr(message, "check_marks", 0)),
+        check_offset_m=float(getattr(message, "check_offset", 0.0)),
+        image=_image_of(message),
+        cell=cell_of(message))
 
 
 def _image_of(message: Any) -> Image | None:

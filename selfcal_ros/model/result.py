@@ -420,24 +420,29 @@ def _parse(data: dict) -> CalibrationResult:
         scale_difference=read(float, emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]))
     seen = _seen_from_dict(read(dict, data["observability"]))
+    camera, stage_yaw = shown_by_images(data.get("camera"))
     return CalibrationResult(
-        read(str, data["plan_id"]), error_map,
-        _plate(amap, artifact, raw),
-        tuple(map(_view, data["views"])), seen, read(Noise, data["noise"]),
-        {key: read(int, value) for key, value in data["rejected"].items()},
-        {key: read(str, value) for key, value in data["input"].items()},
-        read(tuple[str, ...], data.get("warnings", [])),
-        read(str, data.get("method", "joint")),
-        read(str, data.get("measurement_sense", "microscope_moves")),
-        {key: value for key, value in data.items() if key not in _KNOWN},
-        verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
-        read(ModelResult, data.get("model") or {}),
-        reference_from_dict(data.get("reference")),
-        provenance_from_dict(data.get("provenance")), read(str, data.get("run_id", "")),
-        findings_from_list(Finding, data.get("findings", [])),
-        budget_from_list(data.get("budget", [])),
-        artifact if artifact.map_grid else None,
-        read(Recheck | None, data.get("recheck")), *shown_by_images(data.get("camera")))
+        read(str, data["plan_id"]), error_map, _plate(amap, artifact, raw),
+        views=tuple(map(_view, data["views"])),
+        observability=seen,
+        noise=read(Noise, data["noise"]),
+        rejected={key: read(int, value) for key, value in data["rejected"].items()},
+        input={key: read(str, value) for key, value in data["input"].items()},
+        warnings=read(tuple[str, ...], data.get("warnings", [])),
+        method=read(str, data.get("method", "joint")),
+        sense=read(str, data.get("measurement_sense", "microscope_moves")),
+        extra={key: value for key, value in data.items() if key not in _KNOWN},
+        verdict=verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
+        model=read(ModelResult, data.get("model") or {}),
+        reference=reference_from_dict(data.get("reference")),
+        provenance=provenance_from_dict(data.get("provenance")),
+        run_id=read(str, data.get("run_id", "")),
+        findings=findings_from_list(Finding, data.get("findings", [])),
+        budget=budget_from_list(data.get("budget", [])),
+        placed_plate=artifact if artifact.map_grid else None,
+        recheck=read(Recheck | None, data.get("recheck")),
+        camera=camera,
+        stage_yaw=stage_yaw)
 
 
 def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:

@@ -260,11 +260,14 @@ class SolvingSession:
         artifact = artifacts.pop()
         views = tuple(to_model.view_readings(message) for message in ordered)
         check_plate(artifact, views)
-        return Measurements(ordered[0].plan_id, artifact, views,
-                            to_model.sense_of(ordered[0]),
-                            to_model.counts(newest, "session_reject"), self._run.run_id,
-                            to_model.terms_of(newest), to_model.plate_from(newest),
-                            to_model.verify_of(newest))
+        return Measurements(
+            ordered[0].plan_id, artifact, views,
+            sense=to_model.sense_of(ordered[0]),
+            rejected=to_model.counts(newest, "session_reject"),
+            run_id=self._run.run_id,
+            model_terms=to_model.terms_of(newest),
+            artifact_from=to_model.plate_from(newest),
+            verify=to_model.verify_of(newest))
 
     def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""

@@ -320,13 +320,26 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         phi += rng.normal(0, spread.phi_common_rad)
         t += rng.normal(0, spread.t_common_m, 2)
     return Truth(
-        artifact, g, a, g_theta, a_theta, phi, t, spread.rotation == "linear", spread.microscope,
-        spread.wiring, spread.line_factor,
-        spread.microscope_distortion / spread.microscope_field_m**2,
-        np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
-        np.array([spread.backlash_x_m, spread.backlash_y_m]), spread.backlash_growth_m,
-        spread.settling_m, spread.settling_time_s, plate_bow_m=spread.plate_bow_m,
-        waves=waves, waves_theta=waves_theta, yaw=yaw, **drawn)
+        artifact, g, a,
+        g_theta=g_theta,
+        a_theta=a_theta,
+        phi_rad=phi,
+        t_m=t,
+        linear=spread.rotation == "linear",
+        microscope=spread.microscope,
+        wiring=spread.wiring,
+        line_factor=spread.line_factor,
+        distortion=spread.microscope_distortion / spread.microscope_field_m**2,
+        optical_tilt_rad=np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
+        backlash_m=np.array([spread.backlash_x_m, spread.backlash_y_m]),
+        backlash_growth_m=spread.backlash_growth_m,
+        settling_m=spread.settling_m,
+        settling_time_s=spread.settling_time_s,
+        plate_bow_m=spread.plate_bow_m,
+        waves=waves,
+        waves_theta=waves_theta,
+        yaw=yaw,
+        **drawn)
 
 
 def _stage(artifact: Artifact, spread: Spread,

@@ -232,9 +232,15 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     if repeats is None:
         value = -error
         whole = float(np.ptp(value))
-        return AxisFigures("xy"[axis], line_m, position, value, value, nothing,
-                           nothing, (0, 0), left_out, {
-                               "M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
+        return AxisFigures(
+            "xy"[axis], line_m, position,
+            up_m=value,
+            down_m=value,
+            s_up_m=nothing,
+            s_down_m=nothing,
+            approaches=(0, 0),
+            left_out_m=left_out,
+            figures={"M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
     items = [repeats[site] for site in known]
     s_up, s_down, reversal, u_reversal, dof_up, dof_down, sign = (
         np.array([getattr(item, name) for item in items]) for name in (
@@ -251,10 +257,15 @@ def axis_figures(stage: StageMap, axis: int, line: int,
         s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down))
     found = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
-        "xy"[axis], line_m, position, up, down, s_up, s_down,
-        (int(dof_up.min()) + 1, int(dof_down.min()) + 1), left_out,
-        {name: Figure(float(value), _rms_about(draws[name], float(value)))
-         for name, value in found.items()})
+        "xy"[axis], line_m, position,
+        up_m=up,
+        down_m=down,
+        s_up_m=s_up,
+        s_down_m=s_down,
+        approaches=(int(dof_up.min()) + 1, int(dof_down.min()) + 1),
+        left_out_m=left_out,
+        figures={name: Figure(float(value), _rms_about(draws[name], float(value)))
+                 for name, value in found.items()})
 
 
 def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -232,9 +232,18 @@ def map_figures(emap: ErrorMap) -> MapFigures:
     max_theta, line = largest(emap.g_theta)
     u_theta = emap.u_g_theta[np.isfinite(emap.g_theta)]
     return MapFigures(
-        known.size, int(known.sum()), max_error, _site(emap, index), rms(g), rms(u),
-        largest(u)[0], emap.g_theta.size, int(np.isfinite(emap.g_theta).sum()), max_theta,
-        line[0] if line else None, rms(emap.g_theta), rms(u_theta), largest(u_theta)[0])
+        known.size, int(known.sum()), max_error,
+        max_site=_site(emap, index),
+        rms_error_m=rms(g),
+        rms_u_m=rms(u),
+        max_u_m=largest(u)[0],
+        n_lines=emap.g_theta.size,
+        n_lines_known=int(np.isfinite(emap.g_theta).sum()),
+        max_theta_rad=max_theta,
+        max_line=line[0] if line else None,
+        rms_theta_rad=rms(emap.g_theta),
+        rms_u_theta_rad=rms(u_theta),
+        max_u_theta_rad=largest(u_theta)[0])
 
 
 def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | None:
