@@ -120,7 +120,15 @@ class HuLaw:
         a = np.stack([u0x, u0y]) - g                                                 # eq. 18
         t3 = v3 - g[:, 1:] - a[:, :-1] - phi3 * np.stack([-y, x])[:, :-1]            # eq. 15
         t = np.stack([t0, t1, np.full_like(t0, np.nan), t3.mean(axis=(1, 2))])
-        return HuSolution(g, a, g_theta, vt[0] - phi0 - g_theta, phi, t, o, r, rest_xy, rest_theta)
+        return HuSolution(
+            g, a, g_theta,
+            a_theta=vt[0] - phi0 - g_theta,
+            phi=phi,
+            t=t,
+            o=o,
+            r=r,
+            rest_xy=rest_xy,
+            rest_theta=rest_theta)
 
     def _left_by_phi3(self) -> np.ndarray:
         """Return the residual of eq. 25 caused by an error of phi3, of unit length.
@@ -267,8 +275,15 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     sites = artifact.shape[0] * artifact.shape[1]
     result = CalibrationResult(
         measurements.plan_id,
-        ErrorMap(artifact, gx, gy, u_gx, u_gy, g_theta, u_theta, float(found.o[0]),
-                 float(found.r[0]), law.datum),
+        ErrorMap(
+            artifact, gx, gy,
+            u_gx=u_gx,
+            u_gy=u_gy,
+            g_theta=g_theta,
+            u_g_theta=u_theta,
+            nonorthogonality=float(found.o[0]),
+            scale_difference=float(found.r[0]),
+            datum_theta=law.datum),
         ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
         tuple(ViewResult(
             view.view.name, view.view.rotation_rad, *view.view.translation_m,

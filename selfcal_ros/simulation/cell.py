@@ -230,8 +230,13 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
             others.append(Seen(sub.cell, quantised(
                 beside + white_noise(rng, settings, size) + shared, settings.resolution_xy_m),
                 np.stack(marks[:2]), there & marks[2]))
-    return GridExposures(visits, visit, indicated, quantised(told, settings.resolution_xy_m),
-                         np.stack([m, n]), there, approach, tuple(others))
+    return GridExposures(
+        visits, visit, indicated,
+        offset=quantised(told, settings.resolution_xy_m),
+        mark=np.stack([m, n]),
+        there=there,
+        approach=approach,
+        others=tuple(others))
 
 
 def white_noise(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
@@ -383,5 +388,13 @@ def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSet
     sigma = settings.sigma_xy_m if kind == Kind.GRID else settings.sigma_theta_rad
     m, n, k = (m, n, k) if settings.with_ids else (0, 0, 0)
     x, y, theta = offset.tolist()
-    return Detection(stamp_ns, int(kind), settings.with_ids, m, n, k, x, y, theta,
-                     sigma if settings.declare_sigma else 0.0, 0.95)
+    return Detection(
+        stamp_ns, int(kind), settings.with_ids,
+        m=m,
+        n=n,
+        k=k,
+        offset_x=x,
+        offset_y=y,
+        offset_theta=theta,
+        sigma=sigma if settings.declare_sigma else 0.0,
+        score=0.95)

@@ -159,8 +159,13 @@ def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: 
         raise InputError("images", f"the image of the motion is sheared by {sheared:.1%}",
                          "check that the moves are shorter than half the distance of two marks, "
                          "and that the encoder axes are those of the camera's stage")
-    return CameraPose(float(found[0]), float(u[0]), float(found[1]), float(u[1]), mirror, sheared,
-                      float(u[2:].max()), noise)
+    return CameraPose(
+        float(found[0]), float(u[0]), float(found[1]),
+        u_turn_rad=float(u[1]),
+        mirror=mirror,
+        sheared=sheared,
+        u_sheared=float(u[2:].max()),
+        noise_px=noise)
 
 
 def require_size(found: CameraPose, *, mark_size_m: float, mark_pixels: float,

@@ -254,8 +254,16 @@ class MarkDetector:
             x, y = offset(mark.u, mark.v, shape, self.settings)
             sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2))
             m, n = known or (0, 0)
-            out.append(Detection(stamp_ns, int(Kind.GRID), known is not None, m, n, 0, x, y, 0.0,
-                                 sigma, mark.score))
+            out.append(Detection(
+                stamp_ns, int(Kind.GRID), known is not None,
+                m=m,
+                n=n,
+                k=0,
+                offset_x=x,
+                offset_y=y,
+                offset_theta=0.0,
+                sigma=sigma,
+                score=mark.score))
         return out
 
 
