@@ -106,11 +106,14 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
         raise InputError("--drift-degree", f"{degree} is not a degree of a drift",
                          f"give 1 to {MAX_DRIFT_DEGREE}")
     order = str(parse_order(args.order, "--order")) if args.order else ""
-    return Assumed(length_m(args.sigma or SIGMA, "--sigma", MOST_M),
-                   length_m(args.stop_error, "--stop-error", MOST_M), degree, order,
-                   _quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD),
-                   _quantity(args.placing, "--placing", RAD_PER, "angle", MOST_RAD),
-                   length_m(args.stage_error, "--stage-error", MOST_M))
+    return Assumed(
+        sigma_m=length_m(args.sigma or SIGMA, "--sigma", MOST_M),
+        stop_error_m=length_m(args.stop_error, "--stop-error", MOST_M),
+        drift_degree=degree,
+        order=order,
+        sigma_rad=_quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD),
+        turn_rad=_quantity(args.placing, "--placing", RAD_PER, "angle", MOST_RAD),
+        error_m=length_m(args.stage_error, "--stage-error", MOST_M))
 
 
 def sizes_of(args: argparse.Namespace) -> dict[str, float]:

@@ -255,9 +255,9 @@ import os, signal, sys
 from selfcal_ros import start
 from selfcal_ros.cli import replay
 
-def play(*args, play=replay._play):
+def play(*args, play=replay._play, **more):
     try:
-        return play(*args)
+        return play(*args, **more)
     finally:
         os.kill(os.getpid(), signal.SIGINT)
 
