@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, solve, report."""
     plan, cell = read_plan(args.plan), read_cell(args.cell)
     bag = Path(args.output)
+    kept = f"{bag} is kept, --resume continues"
     desk = Terminal(args.yes, bag, aside(args))
     if not args.yes and not sys.stdin.isatty():
         raise InputError("stdin", "there is nobody to ask: it is not a terminal",
@@ -58,14 +59,14 @@ def run(args: argparse.Namespace) -> int:
             work.measure(resume=args.resume)
     except (MachineError, NoDataError) as error:
         desk.end()
-        kept = f"; {bag} is kept, --resume continues" if bag.exists() else ""
         kind = NoDataError if isinstance(error, NoDataError) else InputError
-        raise kind(error.where, error.what, f"{error.remedy}{kept}".strip("; ")) from error
+        remedies = filter(None, [error.remedy, kept if bag.exists() else ""])
+        raise kind(error.where, error.what, "; ".join(remedies)) from error
     except (KeyboardInterrupt, SystemExit):
         desk.end()
-        kept = f"{bag} is kept, --resume continues" if bag.exists() else "nothing was measured yet"
+        left = kept if bag.exists() else "nothing was measured yet"
         with contextlib.suppress(OSError):  # of a terminal that is closed
-            print(f"selfcal measure: stopped; {kept}", file=sys.stderr)
+            print(f"selfcal measure: stopped; {left}", file=sys.stderr)
         raise
     desk.end()
     if plan.verify:
