@@ -148,27 +148,30 @@ class BagLines(NamedTuple):
         Unreadable parts and unusable commands, one line each.
     clock : list of str
         Clock steps, one line each.
+    missing : list of str
+        Lost commands, one line each.
     refused : dict
         Reason -> number of refused messages.
     """
 
     lost: list[str]
     clock: list[str]
+    missing: list[str]
     refused: dict[str, int]
 
     @property
     def faults(self) -> list[str]:
         """All lines."""
-        return [*self.lost, *self.clock]
+        return [*self.lost, *self.clock, *self.missing]
 
 
 def bag_lines(path: str | Path, settings: CollectorSettings,
               namespace: str | None = None) -> BagLines:
     """Return the problems of a bag, like `collect_bag`."""
     reader = BagReader(Path(path), namespace, settings.clock_limit)
-    reader, collector = _fed(reader, settings, [COMMAND_TOPIC])
+    reader, collector = _fed(reader, settings, [COMMAND_TOPIC, DETECTION_TOPIC])
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
-    return BagLines(reader.lost, clock, collector.unusable)
+    return BagLines(reader.lost, clock, collector.missing_commands(), collector.unusable)
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:

@@ -102,13 +102,14 @@ def run(args: argparse.Namespace) -> int:
                 write_json(args.output, data)
             if on_stdout(args):
                 put(data)
-        _refuse_fault(args, code, detector, folder)
+        _refuse_fault(args, code, detector, folder, said=bag.faults)
         if code or not saved.exists():  # perhaps a result without a map
             return code or 1
     result = result_from_dict(data, args.bag)
-    used = sum(view.used for view in result.views)
-    for line in rejections(result.rejected, used) if not result.warnings else ():
-        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+    lines = rejections(result.rejected, sum(view.used for view in result.views))
+    if lines and (detector is not None or not offline(args, args.bag).findings):
+        for line in lines:
+            print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
@@ -121,8 +122,10 @@ def offline(args: argparse.Namespace, bag: str | Path) -> BagSession:
 
 
 def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSettings | None,
-                  folder: Path) -> None:
+                  folder: Path, *, said: Sequence[str]) -> None:
     """Refuse a plan that is not identified because of a fault of the cell, as `solve` does.
+
+    A fault that is `said` is not repeated.
 
     Raises
     ------
@@ -138,7 +141,8 @@ def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSetting
         session = offline(args, bag)
         for fault in session.findings:
             if fault not in session.lost:
-                raise InputError(args.bag, fault, "correct this first")
+                raise InputError(args.bag, "not identified, for the reason said first"
+                                 if fault in said else fault, "correct this first")
 
 
 def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path) -> Path:

@@ -18,7 +18,7 @@ from selfcal_ros.bagio.offline import Playlist, bag_input, bag_lines
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main as selfcal
-from selfcal_ros.collection.inputs import Detection
+from selfcal_ros.collection.inputs import Command, Detection, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
 from selfcal_ros.messages.from_model import event_fields
@@ -265,6 +265,32 @@ def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, caps
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 0
     assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
+
+
+@pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90, tx", 2)])
+def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
+        monkeypatch, tmp_path, capsys, plan, code):
+    bag, plan = tmp_path / "lost.mcap", small_plan(plan, repeats=4)
+    index = next(i for i, view in enumerate(plan.views) if view.name == "tx")
+    Foreign().write(bag, [event for event in events_of(plan) if not (
+        isinstance(event, Command) and event.phase == Phase.MEASURE
+        and event.view_index == index)])
+    solved = tmp_path / "solved.json"
+    assert selfcal(["solve", str(bag), "--quiet", "-o", str(solved)]) == code
+    lost = capsys.readouterr().err.splitlines()[0]
+    assert "view 'tx' was placed, and " in lost and "MEASURE command is missing" in lost
+
+    @contextmanager
+    def process(module, given, *_, **__):
+        if module.endswith("replay_session"):
+            write_json(given[3], read_json(solved))
+        yield SimpleNamespace(stdout=[], wait=lambda: 3 if code else 0)
+    monkeypatch.setattr(replay_verb, "process", process)
+    assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == code
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first == lost.replace("selfcal solve: ", "selfcal replay: ")
+    assert others == [f"selfcal replay: {bag}: not identified, for the reason said first; "
+                      "correct this first"] * bool(code)
 
 
 def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypatch, tmp_path):
