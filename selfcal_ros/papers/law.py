@@ -15,8 +15,9 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.joint.problem import FLOOR, NoiseEstimate, noise_estimate, pooled
+from selfcal_ros.estimation.joint.problem import NoiseEstimate, noise_estimate, pooled
 from selfcal_ros.estimation.joint.solve import Solved, noise_of
+from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, half_axis_slopes

@@ -397,7 +397,7 @@ def test_a_large_field_is_said_to_be_predicted_on_a_smaller_one(monkeypatch):
     plan = plan_from_dict(read_yaml(shipped("hu")), "p")
     assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == ""
     where = "selfcal_ros.estimation.observability.plan_check"
-    monkeypatch.setattr(f"{where}.MAX_SITES", 20)
+    monkeypatch.setattr(f"{where}.UNASKED_SITES", 20)
     monkeypatch.setattr(f"{where}.PROXY_SIZE", 5)
     assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == (
         "predicted for a field of 5 x 5 sites; XY is about 5 % larger for each doubling of the "

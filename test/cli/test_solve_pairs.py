@@ -147,7 +147,7 @@ def test_options_that_contradict_each_other(bags, bag, words, tmp_path, capsys):
     (bag, number) for bag, rows in ROWS.items() for number in range(len(rows))])
 def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(validation, "DRAWS", 32)
+    monkeypatch.setattr(validation, "N_DRAWS", 32)
     capsys.readouterr()
     row = {"method": 0, **ROWS[bag][number]}
     (tmp_path / "nodes.yaml").write_text("solver: {ros__parameters: {drift_degree: 2}}")

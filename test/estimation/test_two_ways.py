@@ -98,7 +98,7 @@ def test_robust_knows_finite_rotations_of_a_rough_plate():
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits of predictions roughly: what is compared here is the prediction."""
-    monkeypatch.setattr(validation, "DRAWS", 16)
+    monkeypatch.setattr(validation, "N_DRAWS", 16)
 
 
 @pytest.mark.parametrize("sense", Sense)

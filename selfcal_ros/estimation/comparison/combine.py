@@ -31,7 +31,7 @@ from selfcal_ros.estimation.comparison.maps import (
     without,
 )
 from selfcal_ros.estimation.datum.covariance import NO_NOISE, USUAL_LEVEL
-from selfcal_ros.estimation.joint.problem import coverage_factor
+from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, coverage_factor
 from selfcal_ros.estimation.joint.solve import KEY, factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
@@ -67,9 +67,6 @@ from selfcal_ros.model.verdict import (
     Verdict,
 )
 
-SAME = 1e-3
-"""Difference of two maps, rms over u, below which they are of the same readings: two recordings
-repeat each other no better than their noise."""
 OTHER_UNIT = 300.0
 """How many times larger the errors in a table are that is not in m or rad."""
 
@@ -115,7 +112,7 @@ def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray]
                                      "negative agrees, and it does not",
                                      "give G = indicated - true")
             for other in range(index if kind == "xy" else 0):
-                if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < SAME:
+                if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < NEGLIGIBLE:
                     raise InputError(part.name, f"of the same readings as {parts[other].name}: "
                                      "their maps are equal", "leave one of them out")
 
@@ -636,7 +633,7 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
     run, also = ((result.run_id, result.provenance.extra.get("first_exposure"),
                   result.provenance.extra.get("last_exposure")) for result in (one, other))
     return all(run) and run == also and bool(np.isclose(
-        one.noise.sigma_xy_repeats, other.noise.sigma_xy_repeats, rtol=SAME, atol=0.0,
+        one.noise.sigma_xy_repeats, other.noise.sigma_xy_repeats, rtol=NEGLIGIBLE, atol=0.0,
         equal_nan=True))
 
 

@@ -17,6 +17,7 @@ from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.estimation.normal.equations import Memo, NormalEquations
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.visits import TermInputs
+from selfcal_ros.estimation.verdict.leverage import N_DRAWS
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import CellsSeen, View, cells_seen
@@ -25,10 +26,6 @@ IMAGES = "images"
 """Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
 degrees of freedom of that of a mark, and of each grid view the `placing` of the plate, a number,
 and the `step` (m, n) of its cell on the plate."""
-
-SAMPLES = 60_000
-"""Readings of all draws together, and limits of the number of draws."""
-FEWEST, MOST = 24, 64
 
 
 @dataclass(frozen=True)
@@ -247,10 +244,10 @@ def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> Im
     grid = system.grid
     stops = stops_of(views, grid.read)
     weight = grid.weight[grid.read]
-    drawn = np.zeros((int(np.clip(SAMPLES // len(stops), FEWEST, MOST)), 2, 3))
+    drawn = np.zeros((N_DRAWS, 2, 3))
     fitted = _fitted_terms(system, columns)
     plain = ImageNoise(stops, grid.read, weight, drawn,
-                       np.zeros((len(drawn), 2, 3 * len(views))), fitted)
+                       np.zeros((N_DRAWS, 2, 3 * len(views))), fitted)
     power = np.zeros(2)
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):

@@ -25,7 +25,6 @@ from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
     DECLARED_DOF,
-    FLOOR,
     NEGLIGIBLE,
     ROUNDING,
     JointFit,
@@ -38,7 +37,7 @@ from selfcal_ros.estimation.joint.problem import (
     sigma_of,
 )
 from selfcal_ros.estimation.lattice.maps import MapSpline
-from selfcal_ros.estimation.normal.angular import MAX_FULL, MAX_STEPS, ROUNDED
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, MAX_STEPS, ROUNDED
 from selfcal_ros.estimation.normal.equations import PlacedEquations, PlacedSystem
 from selfcal_ros.estimation.terms.columns import TermColumns, term_columns
 from selfcal_ros.estimation.terms.equations import (

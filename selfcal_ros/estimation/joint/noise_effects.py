@@ -15,15 +15,13 @@ from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR, MIN_REPEAT_DOF, SAME, noise_excess
+from selfcal_ros.estimation.joint.problem import F_LEVEL, MIN_REPEAT_DOF, SAME, noise_excess
+from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.normal.equations import BLOCK
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
 ADDED = "first_order_added"
 """Key of what such noise adds to the variances of O and R times the half width, unit noise."""
-
-MAX_STRUCTURED = 51 * 51
-"""Largest field in which the axes are told apart: the time grows with the square of the sites."""
 
 
 def axis_contrast(model: ModelFit) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import fdtrc, stdtrit
 
-from selfcal_ros.estimation.checks.wiring import F_LEVEL
+from selfcal_ros.estimation.checks.wiring import F_LEVEL, LEAST_NOISE_M
 from selfcal_ros.estimation.datum.covariance import (
     NO_NOISE,
     Conditions,
@@ -22,11 +22,10 @@ from selfcal_ros.estimation.datum.covariance import (
 from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
-from selfcal_ros.estimation.normal.angular import MAX_STEPS
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options, ReferenceLength
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, between_visits, squares_within
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
@@ -178,9 +177,6 @@ def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor
 
 ROUNDING = 16 * np.finfo(float).eps
 """Noise below this part of the largest deviation is rounding."""
-
-FLOOR = 1e-13
-"""Noise, m or rad, that is rounding and not tested."""
 
 LEAST_NOISE_RAD = 1e-9
 """Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all

@@ -22,6 +22,7 @@ from selfcal_ros.errors import (
     NotIdentifiableError,
     NotSettledError,
 )
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.datum.covariance import (
     NO_NOISE,
     LinesCovariance,
@@ -33,7 +34,6 @@ from selfcal_ros.estimation.joint.images import IMAGES, image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model, placed
 from selfcal_ros.estimation.joint.noise_effects import (
     ADDED,
-    MAX_STRUCTURED,
     image_variances,
     structured,
 )
@@ -47,14 +47,18 @@ from selfcal_ros.estimation.joint.problem import (
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import MAX_FULL, ROUNDED
-from selfcal_ros.estimation.normal.equations import NormalEquations, system_for
+from selfcal_ros.estimation.normal.equations import (
+    MAX_NODES,
+    UNASKED_SITES,
+    NormalEquations,
+    system_for,
+)
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
-    LEAST_NOISE_M,
     TermEquations,
     require_terms_told,
     roots_by_term,
@@ -366,10 +370,6 @@ def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
             for name in dict.fromkeys(names.tolist()) if name != FREE}
 
 
-UNASKED_SITES = 201 * 201
-"""Largest field with an uncertainty and a search for causes unasked: a second, beyond many."""
-
-
 def solve_joint(measurements: Measurements, options: Options, *,
                 whole_only: bool = False) -> Solved:
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`.
@@ -593,7 +593,7 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
         lines = LinesCovariance(cover, (found.xy.sigma, found.theta.sigma))
         if wanted:
             variance = cover.of_stage
-            if system.grid.n_sites <= MAX_STRUCTURED:
+            if system.grid.n_sites <= MAX_NODES:
                 more = structured(model, cover)
                 variance = variance + more
                 if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
@@ -657,7 +657,7 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     # the plate's covariance takes a factor of its own, as large as that of the stage
     if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
-        if system.grid.n_sites <= MAX_STRUCTURED and placed(problem) is None:
+        if system.grid.n_sites <= MAX_NODES and placed(problem) is None:
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:

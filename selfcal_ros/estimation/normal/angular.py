@@ -29,6 +29,9 @@ ROUNDED = 1e-12
 """Relative size of what is rounding alone, an eigenvalue, a variance, a factor, a change: exact
 lines leave eigenvalues of 1e-9 that are told."""
 
+FLOOR = 1e-13
+"""Noise or change, m or rad, that is rounding and not tested."""
+
 
 class AngularSystem:
     """Normal equations of a set of angular readings, independent of their values.

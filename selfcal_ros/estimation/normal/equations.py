@@ -390,7 +390,10 @@ BLOCK = 128
 """Number of marks, nodes or lines computed at once."""
 
 MAX_NODES = 57 * 57
-"""Largest map whose matrix is factorised: 2 GB and half a minute."""
+"""Largest map whose full matrix is factorised, or used: 2 GB and half a minute."""
+
+UNASKED_SITES = 201 * 201
+"""Largest field with an uncertainty and a search for causes unasked: a second, beyond many."""
 
 
 class DenseFactor:

@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal_ros.estimation.datum.covariance import MapsCovariance, conditions_for, lines_alone
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import NormalEquations, planned_system
+from selfcal_ros.estimation.normal.equations import UNASKED_SITES, NormalEquations, planned_system
 from selfcal_ros.estimation.observability.rank import (
     add_views,
     full_observability,
@@ -26,9 +26,6 @@ from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import ORDERS, Plan, View, parse_order, with_sub_views
-
-MAX_SITES = 151 * 151
-"""Largest field whose uncertainty map is predicted in full."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +168,8 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
 def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     """Return the uncertainties predicted for a plan if every mark is read.
 
-    Fields above MAX_SITES are predicted on a smaller field, which is the shape of the result: the
-    gain grows slowly, as log N, so the prediction is then too small.
+    Fields above UNASKED_SITES are predicted on a smaller field, which is the shape of the result:
+    the gain grows slowly, as log N, so the prediction is then too small.
     """
     judged = predicted_on(plan)
     return predict(planned_system(judged.artifact, judged.views), judged.artifact, datum,
@@ -180,8 +177,8 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
 
 
 def predicted_on(plan: Plan) -> Plan:
-    """Return the plan, on a field of PROXY_SIZE sites per side if its own has above MAX_SITES."""
-    return smaller(plan, PROXY_SIZE) if math.prod(plan.artifact.shape) > MAX_SITES else plan
+    """Return the plan, on a field of PROXY_SIZE sites a side if it has above UNASKED_SITES."""
+    return smaller(plan, PROXY_SIZE) if math.prod(plan.artifact.shape) > UNASKED_SITES else plan
 
 
 def unit_repeats(plan: Plan) -> int:

@@ -48,6 +48,7 @@ from selfcal_ros.estimation.terms.planned import (
     rows_of,
     with_terms,
 )
+from selfcal_ros.estimation.verdict.uncertainty import OWED
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import TIMES, UNTOLD, ModelTerm, nominal_terms
@@ -106,7 +107,7 @@ def nominal_sizes() -> dict[str, float]:
 class PlannedTerms:
     """All terms with the grid readings of a plan that identifies the stage.
 
-    Fields above MAX_SITES are evaluated on a smaller one.
+    Fields above UNASKED_SITES are evaluated on a smaller one.
 
     Parameters
     ----------
@@ -274,9 +275,6 @@ NOISE = "reading noise"
 
 QUANTITIES = ("xy", "theta")
 
-MATTERS = 0.05
-"""Share of u^2 from which a change of the plan that removes a line is sought."""
-
 REMOVED = 0.7
 """Part of a line that may be left by what removes it."""
 
@@ -419,7 +417,7 @@ def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
 
     out = {}
     for line in budget.lines:
-        if line.component == NOISE or not budget.share(line) > MATTERS:
+        if line.component == NOISE or not budget.share(line) > OWED:
             continue
         kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)

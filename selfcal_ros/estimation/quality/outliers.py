@@ -30,13 +30,15 @@ import numpy as np
 from scipy.special import chdtri
 
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.joint.problem import FLOOR, Problem
+from selfcal_ros.estimation.checks.wiring import BEYOND_DOUBT
+from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.angular import MAX_FULL
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE, Memo, NormalEquations, grid_residuals
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (
+    MAX_CAUSES,
     PLACES,
     SLIP,
     PlacedSlip,
@@ -47,6 +49,7 @@ from selfcal_ros.estimation.verdict.causes import (
 )
 from selfcal_ros.estimation.verdict.leverage import (
     FEW_DRAWS,
+    MAX_REMOVED,
     Alone,
     lines_alone,
     marks_alone,
@@ -159,9 +162,6 @@ def noisy_views(residuals: Residuals, measurements: Measurements
 AMBIGUOUS = 16.0
 """Difference of chi^2 up to which two places explain the readings equally well."""
 
-SLIP_LEVEL = 1e-9
-"""Level of the test of each place where the plate may have slipped."""
-
 MAX_PLACES = 20
 """Largest number of places tested along each axis of a view."""
 
@@ -246,7 +246,7 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
              for place in _places(problem, measurements)]
     sizes, left, places = [], [], []
     for gain, place in sorted(gains, key=lambda tried: -tried[0])[:PLACES]:
-        if gain >= sigma_m**2 * chdtri(3, SLIP_LEVEL):
+        if gain >= sigma_m**2 * chdtri(3, BEYOND_DOUBT / len(gains)):
             size, _ = _second_misalignment(problem, place, marks.residual)
             after = grid_residuals(problem.system, _slipped(problem, place, size))
             places.append(replace(place, chi2=gain / sigma_m**2))
@@ -359,22 +359,15 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
 OUTLIER_LEVEL = 0.01
 """Probability that a measurement without outliers loses a reading."""
 
-MAX_ROUNDS = 60
 NEAR_LARGEST = 0.5
 """Share of the largest ratio above which a reading is removed in the same round: an outlier
 increases the residuals of its neighbours."""
-
-MAX_REMOVED = 0.1
-"""Largest share of the readings that is removed; if it is more, the fault is another one."""
 
 NAMED = 5
 """Number of outliers listed in their finding; ``extra["outliers"]`` has all."""
 
 LEFT = {"noisy_view", "too_many_outliers", "outliers_kept", "outliers_given_up", "slips_given_up"}
 """Findings of faults that could not be corrected."""
-
-MAX_SLIPS = 3
-"""Largest number of slips, and of terms that look like slips: more are another fault."""
 
 
 @dataclass(frozen=True)
@@ -446,11 +439,11 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
     """Return the readings split at slips, minus terms that explain them better than a slip."""
     flattened = _flattened(measurements, options)
     at = _Screened(measurements, flattened, residuals_of(flattened, linear))
-    for _ in range(2 * MAX_SLIPS + 1):
+    for _ in range(2 * MAX_CAUSES + 1):
         slip = find_slip(at.residuals, robust_sigma(at.residuals.marks), at.flattened)
         if slip is None:
             return at
-        if len(at.slips) == MAX_SLIPS:
+        if len(at.slips) == MAX_CAUSES:
             break
         cause = likelier_term(at.measurements, options, slip)
         if cause is None:
@@ -500,7 +493,7 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
     """Remove outliers round by round; return them, the last residuals, and why it stopped early."""
     gone: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(MAX_STEPS):
         found = _worst(residuals, measurements)
         if not found:
             break
@@ -514,7 +507,7 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
         gone |= found
     else:
         return (*_restored(measurements, options, gone, residuals),
-                Finding("outliers_given_up", details={"rounds": MAX_ROUNDS}))
+                Finding("outliers_given_up", details={"rounds": MAX_STEPS}))
     return (*_restored(measurements, options, gone, residuals), None)
 
 

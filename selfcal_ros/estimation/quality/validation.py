@@ -23,7 +23,7 @@ from scipy.special import fdtri
 from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import NoDataError, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of
-from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR
+from selfcal_ros.estimation.joint.problem import F_LEVEL
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.lattice.maps import maps_of, rotation_excess
 from selfcal_ros.estimation.lattice.readings import (
@@ -34,6 +34,7 @@ from selfcal_ros.estimation.lattice.readings import (
     pose_of,
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import FULL_SIZE, Marks, lines_of
 from selfcal_ros.estimation.observability.plan_check import (
     SEARCH_SIZE,
@@ -43,24 +44,15 @@ from selfcal_ros.estimation.observability.plan_check import (
 from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_columns
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, reduce_columns
+from selfcal_ros.estimation.terms.equations import reduce_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
-from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, noise_of
+from selfcal_ros.estimation.verdict.leverage import N_DRAWS, noise_of
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
-
-DRAWS = 200
-"""Number of draws in a small field: 10 % uncertainty of the degrees of freedom."""
-
-READINGS_DRAWN = 2_000_000
-"""Largest number of readings in all draws together: larger fields vary less."""
-
-RIGID_STEPS = 8
-"""Iterations for the finite rotation of a held-out view; each gains a factor of its size."""
 
 TOGETHER = 20_000
 """Number of readings computed at once: several draws of a small field, one of a large one."""
@@ -163,8 +155,7 @@ def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
         view = result.views[index]
         phi, tau = view.phi, complex(view.tx, view.ty) * pose.phase.conjugate()
         if not np.isfinite([phi, view.tx, view.ty]).all():
-            phi, tau = _fitted_placing(one[here], marks[here], plate[here],
-                                       steps=RIGID_STEPS if problem.rigid else 0)
+            phi, tau = _fitted_placing(one[here], marks[here], plate[here], rigid=problem.rigid)
         if problem.rigid:
             one -= rotation_excess(phi, marks, plate)
         one -= 1j * phi * marks + tau
@@ -172,14 +163,16 @@ def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
 
 
 def _fitted_placing(errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *,
-                    steps: int) -> tuple[float, complex]:
+                    rigid: bool) -> tuple[float, complex]:
     """Return rotation, rad, and offset, plate frame, m, that fit errors; NaN of too few, (P,)."""
     if len(errors) < 3:
         return np.nan, complex(np.nan)
-    phi, x, y = fitted_misalignment(marks, errors[:, None])[:, 0]
-    for _ in range(steps):
-        rest = errors - rotation_excess(phi, marks, plate)
-        phi, x, y = fitted_misalignment(marks, rest[:, None])[:, 0]
+    excess: np.ndarray | float = 0.0
+    for _ in range(MAX_STEPS):  # each gains a factor of the rotation
+        phi, x, y = fitted_misalignment(marks, (errors - excess)[:, None])[:, 0]
+        before, excess = excess, rotation_excess(phi, marks, plate) * rigid
+        if np.abs(excess - before).max() <= FLOOR:
+            break
     return float(phi), complex(x, y)
 
 
@@ -237,16 +230,15 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
         Their weights.
     """
     grid = model.problem.system.grid
-    n = int(np.clip(READINGS_DRAWN // grid.weight.size, FEW_DRAWS, DRAWS))
     rng = np.random.default_rng(0)
-    noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
+    noise = noise_of(rng, (N_DRAWS, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
-    own = noise_of(rng, (n, *weight.shape), weight)
-    own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, LEAST_NOISE_M)
+    own = noise_of(rng, (N_DRAWS, *weight.shape), weight)
+    own_terms = rng.standard_normal((len(held.own), N_DRAWS)) / max(model.found.xy.sigma, FLOOR)
     views = maps_of(held.grid)
-    squares = np.zeros(n)
+    squares = np.zeros(N_DRAWS)
     step = max(TOGETHER // grid.weight.size, 1)
-    for draws in (slice(first, first + step) for first in range(0, n, step)):
+    for draws in (slice(first, first + step) for first in range(0, N_DRAWS, step)):
         field = fields[:, draws].T.reshape(-1, *grid.views.shape)
         taken = noise[draws]
         if model.equations is not None:

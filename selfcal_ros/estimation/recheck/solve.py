@@ -17,7 +17,6 @@ from selfcal_ros.estimation.comparison.maps import joint_dof, of_square
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
-    FLOOR,
     MIN_REPEAT_DOF,
     SAME,
     NoiseEstimate,
@@ -30,6 +29,7 @@ from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.normal.equations import TRACE, Marks, lines_of, system_of
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options

@@ -15,8 +15,8 @@ from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.comparison.covariance import unit_rows
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import placed, told_coefficients
-from selfcal_ros.estimation.joint.problem import FLOOR, Moving, NoiseEstimate, Problem
-from selfcal_ros.estimation.normal.angular import GAP, MAX_STEPS, AngularSystem
+from selfcal_ros.estimation.joint.problem import Moving, NoiseEstimate, Problem
+from selfcal_ros.estimation.normal.angular import FLOOR, GAP, MAX_STEPS, AngularSystem
 from selfcal_ros.estimation.normal.equations import pseudo_inverse
 from selfcal_ros.estimation.terms.columns import LineColumns, TermColumns
 from selfcal_ros.estimation.terms.equations import lines_eliminated, reduce_columns

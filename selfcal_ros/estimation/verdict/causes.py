@@ -29,12 +29,12 @@ from selfcal_ros.blocks import AXES, Located, block_of, blocks
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
-    FLOOR,
     fit,
     least_noise_rad,
     noise_excess,
     pooled,
 )
+from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, Score, TermEquations, score
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise

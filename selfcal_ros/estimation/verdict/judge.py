@@ -21,6 +21,7 @@ from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import (
+    LEAST_NOISE_M,
     SHOWN,
     contradicted_scale,
     sign_is_shown,
@@ -32,8 +33,9 @@ from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL, LEAST_NOISE_M
+from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.verdict.causes import NOISY
+from selfcal_ros.estimation.verdict.leverage import MAX_REMOVED
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
@@ -62,8 +64,8 @@ show the sign of the offsets."""
 LACK_LEVEL = 0.02
 """Two-sided level from which residuals beyond the scatter of repeats count as lack of fit."""
 
-FEW_OUTLIERS, MANY_OUTLIERS = 5, 0.1
-"""Outliers among repeats of a view, and their part of its readings, that are not chance."""
+FEW_OUTLIERS = 5
+"""Outliers among repeats of a view that are not chance, if they are above `MAX_REMOVED` as well."""
 
 
 @one_thread()
@@ -315,7 +317,7 @@ def _repeats_findings(measurements: Measurements) -> list[Finding]:
         found[name] = before[0] + lost, before[1] + lost + view.used
     return [Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
             for name, (lost, total) in found.items()
-            if lost > max(FEW_OUTLIERS, MANY_OUTLIERS * total)]
+            if lost > max(FEW_OUTLIERS, MAX_REMOVED * total)]
 
 
 def _left_out_findings(measurements: Measurements) -> list[Finding]:

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from selfcal_ros.estimation.joint.problem import FLOOR
-from selfcal_ros.estimation.normal.angular import MAX_FULL, AngularSystem
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, AngularSystem
 from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
@@ -23,10 +22,13 @@ from selfcal_ros.estimation.normal.equations import (
 from selfcal_ros.estimation.normal.grid import GridSystem
 
 N_DRAWS = 64
-"""Draws of unit noise for a larger field: 9 % standard error of a residual's variance."""
+"""Draws of unit noise for a variance, of a residual as of an image: 9 % standard error."""
 
 FEW_DRAWS = 16
 """Draws of noise where a sum over many readings is wanted: one draw tells it to a few per cent."""
+
+MAX_REMOVED = 0.1
+"""Largest share of readings that are outliers; if it is more, the fault is another one."""
 
 CHECKED = 0.05
 """Smallest 1 - h of a reading that the others can check."""

@@ -23,10 +23,10 @@ from selfcal_ros.estimation.joint.model_fit import (
     told_coefficients,
     with_map,
 )
-from selfcal_ros.estimation.joint.problem import F_LEVEL, FLOOR
+from selfcal_ros.estimation.joint.problem import F_LEVEL
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline
-from selfcal_ros.estimation.normal.angular import AngularSystem, HarmonicSystem
+from selfcal_ros.estimation.normal.angular import FLOOR, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_residuals
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Interpolation

@@ -13,12 +13,12 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.checks.wiring import BEYOND, BEYOND_DOUBT
+from selfcal_ros.estimation.checks.wiring import BEYOND, BEYOND_DOUBT, LEAST_NOISE_M
 from selfcal_ros.estimation.joint.model_fit import finer
-from selfcal_ros.estimation.joint.solve import UNASKED_SITES, Solved, solve_joint
-from selfcal_ros.estimation.normal.equations import FULL_SIZE
+from selfcal_ros.estimation.joint.solve import Solved, solve_joint
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, UNASKED_SITES
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, SizeTest
+from selfcal_ros.estimation.terms.equations import SizeTest
 from selfcal_ros.estimation.verdict.causes import (
     MAX_CAUSES,
     READING,

@@ -192,7 +192,7 @@ INTERPOLATION = "interpolation"
 """The component that only a map used between its nodes or lines has."""
 
 OWED = 0.1
-"""Share of u^2 from which an assumption is named."""
+"""Share of u^2 from which an assumption, or what removes it, is named."""
 
 TERM = "term "
 """Beginning of the component of a term of the model."""

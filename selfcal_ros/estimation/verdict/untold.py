@@ -10,13 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import equations_of, spread_of
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE
 from selfcal_ros.estimation.joint.solve import Solved
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.equations import LEAST_NOISE_M, TermEquations
+from selfcal_ros.estimation.terms.equations import TermEquations
 from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_of_field
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.terms import UNTOLD, nominal_terms

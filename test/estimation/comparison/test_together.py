@@ -22,7 +22,7 @@ from test.estimation.terms.test_dense_fit import both, measured
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests."""
-    monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
+    monkeypatch.setattr(solve, "MAX_NODES", 0)
     monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.CAUSE_LEVEL)
     monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 

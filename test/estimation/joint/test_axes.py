@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.joint import noise_effects, solve
+from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.noise_effects import axis_contrast
 from selfcal_ros.estimation.joint.solve import solve_joint
+from selfcal_ros.estimation.normal.equations import MAX_NODES
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
@@ -75,7 +76,7 @@ def test_above_a_size_both_axes_have_one_uncertainty(monkeypatch):
     _, readings = measured(0.2)
     options = Options(assumed=(), causes=False)
     told = solve_joint(readings, options).result.error_map
-    monkeypatch.setattr(solve, "MAX_STRUCTURED", 24)
+    monkeypatch.setattr(solve, "MAX_NODES", 24)
     common = solve_joint(readings, options).result.error_map
     assert np.nanmean(told.u_gx) > np.nanmean(common.u_gx) > np.nanmean(told.u_gy)
-    assert noise_effects.MAX_STRUCTURED >= 21**2
+    assert MAX_NODES >= 21**2

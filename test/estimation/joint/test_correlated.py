@@ -69,7 +69,7 @@ def test_slow_noise_is_in_the_uncertainty(monkeypatch):
         truth, readings = measured(11, seed, slow_m=20e-9)
         inside.append(covered(calibrate(readings, flat), truth.g))
         with monkeypatch.context() as patch:
-            patch.setattr(solve, "MAX_STRUCTURED", 0)
+            patch.setattr(solve, "MAX_NODES", 0)
             unaware.append(covered(calibrate(readings, flat), truth.g))
     assert np.mean(inside) > max(0.93, np.mean(unaware) + 0.01)
 

@@ -273,7 +273,7 @@ def test_long_fields_are_predicted_on_long_ones(size, size_y, monkeypatch):
     """A square would promise two thirds of the uncertainty, and half of the largest one."""
     plan = plan_of("0, 90, tx, ty", size, size_y=size_y)
     full = predict_plan(plan, "xy_axes")
-    monkeypatch.setattr(plan_check, "MAX_SITES", 100)
+    monkeypatch.setattr(plan_check, "UNASKED_SITES", 100)
     monkeypatch.setattr(plan_check, "PROXY_SIZE", 11)
     found = predict_plan(plan, "xy_axes")
     assert found.ux.size < full.ux.size and found.ux.shape != full.ux.shape

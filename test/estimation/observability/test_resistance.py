@@ -198,7 +198,7 @@ def test_a_power_is_the_rate_of_drawn_tests():
 
 
 def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
-    monkeypatch.setattr(plan_check, "MAX_SITES", 100)
+    monkeypatch.setattr(plan_check, "UNASKED_SITES", 100)
     monkeypatch.setattr(plan_check, "PROXY_SIZE", 9)
     large, small = (PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9))
     assert check_terms(large, {}, LEVEL) == check_terms(small, {}, LEVEL)

@@ -80,7 +80,7 @@ def test_equal_repeats_change_nothing_for_an_averaged_reading():
 
 
 def test_large_fields_are_predicted_on_a_smaller_one_and_say_so(monkeypatch):
-    monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.MAX_SITES", 100)
+    monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.UNASKED_SITES", 100)
     monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.PROXY_SIZE", 9)
     found = predict_plan(plan_of("0, 90, tx", 21), ThetaDatum.XY_AXES)
     assert found.ux.shape == (9, 9)

@@ -225,13 +225,13 @@ def test_the_visits_of_a_split_view_stay_with_their_marks():
 
 
 def test_giving_up_is_said(monkeypatch):
-    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_ROUNDS", 1)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_STEPS", 1)
     _, readings = measured(3)
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
     text = " ".join(worded(robust_calibrate(bad, ZERO_MEAN)).warnings)
     assert "gave up on outliers after 1 rounds: the readings seem to contain more" in text
     refused(robust_calibrate(bad, ZERO_MEAN), "gave up on outliers after 1 rounds")
-    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_SLIPS", 0)
+    monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_CAUSES", 0)
     _, readings = measured(4, more=True)
     moved = slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0))
     result = robust_calibrate(moved, ZERO_MEAN)

@@ -63,7 +63,7 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     Terms are free and each mark is visited once, so that no other draw has a part in it. A drift
     is of each view, a turned microscope common to all; only with that can a view be held out.
     """
-    monkeypatch.setattr(validation, "DRAWS", 4)
+    monkeypatch.setattr(validation, "N_DRAWS", 4)
     plan = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
     rng = np.random.default_rng(8)
     readings = with_visits(simulate_measurements(random_truth(

@@ -48,7 +48,7 @@ def called(item):
 @pytest.fixture
 def few_draws(monkeypatch):
     """Draw the limits roughly, in tests that do not ask for them."""
-    monkeypatch.setattr(validation, "DRAWS", 16)
+    monkeypatch.setattr(validation, "N_DRAWS", 16)
 
 
 @pytest.mark.parametrize("sense", list(Sense))

@@ -56,7 +56,7 @@ def test_one_degree_of_freedom_can_contradict_the_plate(dof_noise, p):
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
     """What else noise may be enlarges both maps alike (`Together`)."""
-    monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
+    monkeypatch.setattr(solve, "MAX_NODES", 0)
 
 
 def linear(model="none"):

@@ -63,7 +63,7 @@ PLANS = {
 @pytest.fixture(autouse=True)
 def _equal_white_noise(monkeypatch):
     """What else noise may be, and doubt, have their own tests (test_axes.py, test_sizes.py)."""
-    monkeypatch.setattr(solve, "MAX_STRUCTURED", 0)
+    monkeypatch.setattr(solve, "MAX_NODES", 0)
     monkeypatch.setattr(equations, "DOUBT_LEVEL", equations.CAUSE_LEVEL)
 
 
