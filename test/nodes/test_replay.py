@@ -105,7 +105,7 @@ def result_text(session, bag, folder, cell=None):
 
 
 @pytest.mark.parametrize(("solved", "options"), [
-    ("on the lattice", {}), ("on the lattice", {"rate": 50.0}), ("images", {"rate": 50.0}),
+    ("on the lattice", {}), ("on the lattice", {"rate": 50.0}),
     *((name, {"seed": 3}) for name in PLANS)], indirect=["solved"])
 def test_a_session_gives_the_result_of_solve_bit_for_bit(
         graph, solved, tmp_path, options, capfd):
