@@ -14,6 +14,9 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, default_terms
 
 MISALIGNMENT_MODELS = ("linear", "rigid")
+OWED = 0.1
+"""Share of u^2 from which an assumption, or what removes it, is named."""
+
 MAX_EXPANSION_PER_K = 1e-3
 """Coefficient of linear expansion above that of any solid, 1/K."""
 

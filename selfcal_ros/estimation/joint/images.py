@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.normal.angular import GAP
-from selfcal_ros.estimation.normal.equations import Memo, NormalEquations
+from selfcal_ros.estimation.normal.equations import N_DRAWS, Memo, NormalEquations
 from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.visits import TermInputs
-from selfcal_ros.estimation.verdict.leverage import N_DRAWS
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import CellsSeen, View, cells_seen

@@ -395,6 +395,9 @@ MAX_NODES = 57 * 57
 UNASKED_SITES = 201 * 201
 """Largest field with an uncertainty and a search for causes unasked: a second, beyond many."""
 
+N_DRAWS = 64
+"""Draws of unit noise for a variance, of a residual as of an image: 9 % standard error."""
+
 
 class DenseFactor:
     """Factorised Hermitian positive definite matrix over the nodes, with its inverse.

@@ -36,6 +36,7 @@ from selfcal_ros.estimation.observability.plan_check import (
     smaller,
     unit_repeats,
 )
+from selfcal_ros.estimation.options import OWED
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     TermEquations,
@@ -48,7 +49,6 @@ from selfcal_ros.estimation.terms.planned import (
     rows_of,
     with_terms,
 )
-from selfcal_ros.estimation.verdict.uncertainty import OWED
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import TIMES, UNTOLD, ModelTerm, nominal_terms

@@ -35,7 +35,7 @@ from selfcal_ros.estimation.lattice.readings import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import FULL_SIZE, Marks, lines_of
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, Marks, lines_of
 from selfcal_ros.estimation.observability.plan_check import (
     SEARCH_SIZE,
     candidate_views,
@@ -47,7 +47,7 @@ from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_
 from selfcal_ros.estimation.terms.equations import reduce_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
-from selfcal_ros.estimation.verdict.leverage import N_DRAWS, noise_of
+from selfcal_ros.estimation.verdict.leverage import noise_of
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult

@@ -15,14 +15,12 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, AngularSystem
 from selfcal_ros.estimation.normal.equations import (
+    N_DRAWS,
     NormalEquations,
     angular_residuals,
     grid_residuals,
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
-
-N_DRAWS = 64
-"""Draws of unit noise for a variance, of a residual as of an image: 9 % standard error."""
 
 FEW_DRAWS = 16
 """Draws of noise where a sum over many readings is wanted: one draw tells it to a few per cent."""

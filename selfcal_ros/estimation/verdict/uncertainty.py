@@ -22,6 +22,7 @@ from selfcal_ros.estimation.joint.solve import (
     variance_of_terms,
 )
 from selfcal_ros.estimation.normal.angular import MAX_FULL
+from selfcal_ros.estimation.options import OWED
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult, Noise
@@ -190,9 +191,6 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
 
 INTERPOLATION = "interpolation"
 """The component that only a map used between its nodes or lines has."""
-
-OWED = 0.1
-"""Share of u^2 from which an assumption, or what removes it, is named."""
 
 TERM = "term "
 """Beginning of the component of a term of the model."""
