@@ -199,7 +199,7 @@ DISTORTED = {"microscope_distortion": 0.02, "microscope_field_m": 1.414e-3,
 
 @pytest.mark.parametrize(("part", "size", "sense", "runs"), [
     (0.3, 7, Sense.MICROSCOPE_MOVES, 4), (1.0, 9, Sense.PLATE_MOVES, 3),
-    (3.0, 7, Sense.MICROSCOPE_MOVES, 8)])  # the more images share, the fewer numbers a run has
+    (3.0, 7, Sense.MICROSCOPE_MOVES, 6)])  # the more images share, the fewer numbers a run has
 def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense, runs):
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
     assert all(found.verdict.qualified for _, found in results)
@@ -224,15 +224,13 @@ def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
     """Every stop is 1 um off, so that the repeats show the pixel size to 0.1 %."""
     off = {"microscope_scale": 0.005, "microscope_rotation_rad": -0.02,
            "microscope_distortion": 0.02, "microscope_field_m": 1.414e-3}
-    for seed in range(2):
-        _, readings = measured(MARK, seed, repeats=4, sense=sense, servo_m=1e-6, **off)
-        assert calibrate(readings, Options(causes=False)).verdict.qualified
-        longer = np.diag([1.0, 1.0, 1.01, 1.01])
-        views = tuple(replace(view, motion=replace(
-            view.motion, products=longer @ view.motion.products @ longer))
-            for view in readings.views)
-        failed = calibrate(replace(readings, views=views), Options(causes=False)).verdict.failed
-        assert [one.name for one in failed] == ["scale_of_offsets"]
+    _, readings = measured(MARK, 0, repeats=4, sense=sense, servo_m=1e-6, **off)
+    assert calibrate(readings, Options(causes=False)).verdict.qualified
+    longer = np.diag([1.0, 1.0, 1.01, 1.01])
+    views = tuple(replace(view, motion=replace(
+        view.motion, products=longer @ view.motion.products @ longer)) for view in readings.views)
+    failed = calibrate(replace(readings, views=views), Options(causes=False)).verdict.failed
+    assert [one.name for one in failed] == ["scale_of_offsets"]
 
 
 def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
