@@ -24,6 +24,7 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.timeline import Timeline, ViewCache, build_timeline, without_strays
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
+from selfcal_ros.model.view import plan_keys
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S
 
@@ -235,7 +236,7 @@ class Collector:
             run_id=timeline.run_id,
             model_terms=timeline.model_terms,
             artifact_from=timeline.artifact_from,
-            verify=timeline.verify), progress
+            **plan_keys(timeline)), progress
 
     def findings(self, measurements: Measurements,
                  progress: dict[int, ViewProgress]) -> dict[int | None, RejectionFinding]:

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.view import Plan
+from selfcal_ros.model.view import Plan, plan_keys
 
 
 class State(StrEnum):
@@ -142,4 +142,4 @@ class Sequencer:
             return Command(0, phase, plan.plan_id, self.index, views_planned=number)
         return Command(0, phase, plan.plan_id, self.index, plan.views[self.index], plan.artifact,
                        number, model_terms=plan.model_terms, artifact_from=plan.artifact_from,
-                       verify=plan.verify)
+                       **plan_keys(plan))

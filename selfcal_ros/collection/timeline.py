@@ -30,7 +30,7 @@ from selfcal_ros.collection.samples import GrowingColumns, GrowingTable
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import ViewReadings
-from selfcal_ros.model.view import View
+from selfcal_ros.model.view import View, plan_keys
 
 NO_END = np.iinfo(np.int64).max
 
@@ -201,8 +201,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
         model_terms=newest.model_terms,
         strays=strays,
         artifact_from=newest.artifact_from,
-        verify=newest.verify,
-        unmeasured=unmeasured)
+        unmeasured=unmeasured,
+        **plan_keys(newest))
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
@@ -239,7 +239,7 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
 def _sort_key(command: Command) -> tuple:
     return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index,
             repr(command.view), repr(command.artifact), command.views_planned, command.run_id,
-            command.model_terms, command.artifact_from, command.verify)
+            command.model_terms, command.artifact_from, *plan_keys(command).values())
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:

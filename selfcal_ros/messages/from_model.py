@@ -23,7 +23,7 @@ from selfcal_ros.model.readings import (
 )
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.model.view import VERIFY, View
+from selfcal_ros.model.view import View, plan_keys
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from selfcal_ros.units import NS_PER_S
 
@@ -124,12 +124,12 @@ def command(c: Command, frame_id: str) -> Fields:
             "check_marks": c.view.check_marks if c.view else 0,
             "check_offset": c.view.check_offset_m if c.view else 0.0, **_map_grid(c.artifact),
             **_image(c.view), "artifact_from": c.artifact_from, **_marks(c.artifact),
-            "plan_keys": _plan_keys(c.verify)}
+            "plan_keys": _plan_keys(c)}
 
 
-def _plan_keys(verify: str) -> list[str]:
+def _plan_keys(source: Command | Measurements) -> list[str]:
     """Return the keys of a plan that have no field of their own."""
-    return [f"{VERIFY}: {verify}"] if verify else []
+    return [f"{key}: {text}" for key, text in plan_keys(source).items() if text]
 
 
 def view_status(progress: ViewProgress, plan_id: str, stamp_ns: int, frame_id: str, *,
@@ -182,7 +182,7 @@ def view_measurement(progress: ViewProgress, measurements: Measurements, stamp_n
         "image_x": (readings.view.cell or (0, 0))[0], "image_y": (readings.view.cell or (0, 0))[1],
         "artifact_from": measurements.artifact_from, **_marks(measurements.artifact),
         "axis_theta": readings.axis_theta, "visit_order": readings.view.visit_order,
-        **_places(readings), "plan_keys": _plan_keys(measurements.verify)}
+        **_places(readings), "plan_keys": _plan_keys(measurements)}
 
 
 def _visits(visits: GridVisits | None) -> Fields:

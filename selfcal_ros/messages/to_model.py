@@ -30,7 +30,7 @@ from selfcal_ros.model.readings import (
     Sense,
     ViewReadings,
 )
-from selfcal_ros.model.view import VERIFY, View, parse_order
+from selfcal_ros.model.view import PLAN_KEYS, View, parse_order
 from selfcal_ros.topics import COMMAND_TOPIC, ERROR_MAP_TOPIC, MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
 
@@ -95,13 +95,14 @@ def command(message: Any) -> Command:
         artifact_of(message) if placed else None,
         views_planned=int(getattr(message, "views_planned", 0)),
         run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message),
-        artifact_from=plate_from(message), verify=verify_of(message))
+        artifact_from=plate_from(message), **plan_keys_of(message))
 
 
 def refuse_unknown_keys(message: Any, topic: str) -> None:
     """Raise InputError if a ViewCommand or ViewMeasurement has a key of a plan unknown here."""
     for text in getattr(message, "plan_keys", ()):
-        if str(text).startswith(f"{VERIFY}: "):
+        key, colon, _ = str(text).partition(": ")
+        if colon and key in PLAN_KEYS:
             continue
         raise InputError(topic, f"the key {printable(str(text).partition(':')[0])!r} of the plan "
                          "is not known here", "run all nodes in the newer version")
@@ -117,10 +118,11 @@ def plate_from(message: Any) -> str:
     return str(getattr(message, "artifact_from", ""))
 
 
-def verify_of(message: Any) -> str:
-    """Return the result whose correction is on in a ViewCommand or ViewMeasurement, or ""."""
-    keys = (str(text).partition(": ") for text in getattr(message, "plan_keys", ()))
-    return next((value for key, _, value in keys if key == VERIFY), "")
+def plan_keys_of(message: Any) -> dict[str, str]:
+    """Return the `PLAN_KEYS` of a ViewCommand or ViewMeasurement, "" for those not there."""
+    texts = reversed([str(text).partition(": ") for text in getattr(message, "plan_keys", ())])
+    found = {key: value for key, _, value in texts}  # the first of a key counts
+    return {key: found.get(key, "") for key in PLAN_KEYS}
 
 
 def notes_of(message: Any) -> tuple[str, ...]:

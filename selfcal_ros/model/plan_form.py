@@ -18,7 +18,14 @@ from selfcal_ros.model.plate_form import (
 )
 from selfcal_ros.model.pose import image_of, turn_in_lines
 from selfcal_ros.model.terms import terms_of, with_microscope
-from selfcal_ros.model.view import Plan, View, parse_order, with_sub_views
+from selfcal_ros.model.view import (
+    PLAN_KEYS,
+    Plan,
+    View,
+    parse_order,
+    plan_keys,
+    with_sub_views,
+)
 from selfcal_ros.units import MM_PER_M
 
 MAX_VIEWS = 1000
@@ -55,7 +62,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
                             {"visit_order": (str, ""), "model_terms": (list, []),
                              "check_stops": (dict, {}), "microscope": (dict, {}),
                              "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, ""),
-                             "verify": (str, "")})
+                             **dict.fromkeys(PLAN_KEYS, (str, ""))})
     artifact = replace(artifact_of(fields["artifact"], f"{where}: artifact"),
                        harmonics=harmonics_of(fields["map"], f"{where}: map"))
     order = _order(fields["visit_order"], where)
@@ -84,7 +91,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     terms = terms_of(fields["model_terms"], where)
     return Plan(fields["plan_id"], artifact, views, with_microscope(
         terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"],
-        fields["verify"])
+        **{key: fields[key] for key in PLAN_KEYS})
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
@@ -185,4 +192,4 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
             **({"image": dict(vars(image))} if image else {}),
             **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
             **({"artifact_from": plan.artifact_from} if plan.artifact_from else {}),
-            **({"verify": plan.verify} if plan.verify else {})}
+            **{key: text for key, text in plan_keys(plan).items() if text}}

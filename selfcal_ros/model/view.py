@@ -32,8 +32,9 @@ PLATE_SUFFIX = "@plate"
 """Suffix for lines of the plate's marks: the same marks in the same order in every view. Without
 it lines are those of the stage's sites: the same sites in the same order in every view. Where the
 map has nodes of its own the lines are always the plate's."""
-VERIFY = "verify"
-"""Key of a plan for the result whose correction is on; it travels among the `plan_keys`."""
+PLAN_KEYS = ("verify",)
+"""Keys of a plan that have no field in the messages and travel there as `plan_keys`: each is a text
+of this name in `Plan`, `Command`, `Timeline` and `Measurements`, empty without it."""
 DEFAULT_ORDER = "serpentine"
 """Order of a cell if none is specified."""
 
@@ -302,6 +303,11 @@ def cells_seen(artifact: Artifact, views: Sequence[View]) -> CellsSeen | None:
     if not any(view.cell is not None for view in views):
         return None
     return tuple((view.plan_view, view.step_on_plate(artifact)) for view in views)
+
+
+def plan_keys(source: object) -> dict[str, str]:
+    """Return the `PLAN_KEYS` of a plan, a command, a timeline or measurements."""
+    return {key: getattr(source, key) for key in PLAN_KEYS}
 
 
 @dataclass(frozen=True)

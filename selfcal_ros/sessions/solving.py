@@ -267,7 +267,7 @@ class SolvingSession:
             run_id=self._run.run_id,
             model_terms=to_model.terms_of(newest),
             artifact_from=to_model.plate_from(newest),
-            verify=to_model.verify_of(newest))
+            **to_model.plan_keys_of(newest))
 
     def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""
@@ -318,7 +318,7 @@ class SolvingSession:
         """Return whether views of a verification are to come: one says less than all."""
         newest = next(iter(self._messages.values()), None)
         over = bool(self._ended & {self._run, Run(self._run.plan_id)})
-        if newest is None or not to_model.verify_of(newest) or over or (
+        if newest is None or not to_model.plan_keys_of(newest)["verify"] or over or (
                 self._views_done >= self._planned_views(self._run)):
             return False
         self.shown = Shown(None, NoDataError("the verification", "views are to come",

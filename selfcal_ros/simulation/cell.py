@@ -12,7 +12,7 @@ import numpy as np
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.view import Plan, View, parse_order
+from selfcal_ros.model.view import Plan, View, parse_order, plan_keys
 from selfcal_ros.model.visit_order import (
     VisitSequence,
     approach_signs,
@@ -332,7 +332,7 @@ def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.ran
         for phase in (Phase.PLACE, Phase.MEASURE):
             yield Command(now, phase, plan.plan_id, index, view, plan.artifact, len(plan.views),
                           model_terms=plan.model_terms, artifact_from=plan.artifact_from,
-                          verify=plan.verify)
+                          **plan_keys(plan))
             now += pause_ns
         for event in view_events(truth, plan, index, settings=settings, rng=rng, start_ns=now):
             yield event

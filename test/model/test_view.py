@@ -2,15 +2,18 @@
 """Plates, views and plans: poses in whole steps, and what a PLAN.yaml may say."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from selfcal_ros.collection.inputs import Command
+from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
-from selfcal_ros.model.view import View, with_sub_views
+from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.view import PLAN_KEYS, Plan, View, plan_keys, with_sub_views
 
 PLATE = Artifact(11, 0.01, 24)
 PLAN = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 24},
@@ -344,3 +347,13 @@ def test_harmonics_that_are_refused(given, message):
     with pytest.raises(InputError) as caught:
         plan_from_dict(plan_with(map=given), "f")
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("key", PLAN_KEYS)
+def test_a_key_of_a_plan_that_travels_has_its_place_everywhere(key):
+    for kind in (Plan, Command, Timeline, Measurements):
+        assert key in [item.name for item in fields(kind)], (
+            f'add `{key}: str = ""` to {kind.__name__}')
+    plan = plan_from_dict(plan_with(**{key: "what it says"}), "p.yaml")
+    assert plan_keys(plan)[key] == plan_to_dict(plan)[key] == "what it says"
+    assert key not in plan_to_dict(plan_from_dict(PLAN, "p.yaml"))
