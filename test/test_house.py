@@ -48,7 +48,10 @@ def layer_of(path: Path) -> str:
 
 def test_the_table_names_every_package():
     alone = {"__init__", "__main__", "forked"}  # import nothing but `start`
-    assert {layer_of(path) for path in SOURCES} - alone == {*documented(), *BASE}
+    layers = {layer_of(path) for path in SOURCES} - alone
+    assert layers == {*documented(), *BASE}, (
+        "in the table of docs/theory/architecture.md, or in BASE above, add or remove "
+        f"{sorted(layers ^ {*documented(), *BASE})}")
 
 
 @pytest.mark.parametrize("layer", [*documented(), *BASE])
@@ -57,11 +60,15 @@ def test_packages_import_what_the_table_states(layer):
     found = {name.split(".")[1] for path in SOURCES if layer_of(path) == layer
              for name in imports(path) if name.startswith("selfcal_ros.")} & {*table, *BASE}
     if layer in BASE:
-        assert found - {layer} == BASE[layer]
+        assert found - {layer} == BASE[layer], f"correct BASE['{layer}'] above, or the import"
     else:
         places = list(table)
-        assert found - {layer, "model", *BASE} == table[layer]
-        assert all(places.index(layer) < places.index(other) for other in table[layer])
+        others = found - {layer, "model", *BASE}
+        assert others == table[layer], (
+            f"the row `{layer}` of docs/theory/architecture.md and its imports differ in "
+            f"{sorted(others ^ table[layer])}: correct the row, or move what is imported")
+        above = [other for other in table[layer] if places.index(other) <= places.index(layer)]
+        assert not above, f"`{layer}` imports what is above it: move it out of {above}"
         assert "start" not in found or layer in ("cli", "nodes")
 
 

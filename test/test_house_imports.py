@@ -84,7 +84,8 @@ def test_the_parts_of_estimation_import_only_those_before_them():
     for module in parts:
         place = ESTIMATION.index(part_of(module))
         for other in graph()[module].intersection(parts):
-            assert ESTIMATION.index(part_of(other)) <= place, f"{module} -> {other}"
+            assert ESTIMATION.index(part_of(other)) <= place, (
+                f"{module} imports the later {other}: move what they share to an earlier part")
 
 
 def test_imports_in_functions_state_their_reason():

@@ -250,9 +250,10 @@ def test_every_verb_takes_json_and_is_documented(name):
 
     import selfcal_ros
 
-    assert "--json" in LEAVES[name]._option_string_actions
+    assert "--json" in LEAVES[name]._option_string_actions, (
+        "call add_json(parser) of cli/terminal.py in configure, and say() in run")
     docs = Path(selfcal_ros.__file__).parents[1] / "docs/reference/json.md"
-    assert f"`{name}`" in docs.read_text()
+    assert f"`{name}`" in docs.read_text(), f"add a row for `{name}` to docs/reference/json.md"
 
 
 @pytest.mark.parametrize("verb", ["solve", "plan", "cal", "step-diagonal"])
@@ -304,7 +305,8 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
               "DATA": root / "config/step_diagonal/case_study.csv"}
     Path("p.csv").write_text("x,y\n0,0\n")
     Path("in.nc").write_text("G21 G90\nG0 X0 Y0\n")
-    assert set(RUNS) | NEEDS_NODES | set(ELSEWHERE) == set(LEAVES)
+    run = set(RUNS) | NEEDS_NODES | set(ELSEWHERE)
+    assert run == set(LEAVES), f"in RUNS above, add or remove {sorted(run ^ set(LEAVES))}"
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]
         if name == "combine":  # the map of another calibration

@@ -59,6 +59,7 @@ def test_the_file_of_all_parameters_states_their_units_and_bounds(node):
     found = re.findall(r"((?:^    # .*\n)+)    (\w+): ", section[section.index(node) + 1], re.M)
     about = {name: " ".join(re.findall(r"# (.*)", words)) for words, name in found}
     for parameter in NODE_PARAMETERS[node]:
+        assert parameter.name in about, "run `make reference`"
         facts = re.fullmatch(r".*? ?(?:\[([^\[]*)\])?", about[parameter.name])[1] or ""
         assert facts.startswith(parameter.unit)
         if parameter.low is not None:

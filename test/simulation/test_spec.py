@@ -303,7 +303,10 @@ def test_numbers_are_those_of_the_documents(name, keys, defaults):
         numbers = [number.split()[0] for number in default.split(", ")]
         for i, key in enumerate(re.findall(r"`(\w+)`", names)):
             said[key] = numbers[min(i, len(numbers) - 1)]
-    assert set(said) == {key for key in keys if not key.endswith("_s")}  # delay_s: as delay
+    taken = {key for key in keys if not key.endswith("_s")}  # delay_s: as delay
+    assert said.keys() == taken, (
+        f"in docs/guides/simulate.md, table of `{name}`, add or remove the rows of "
+        f"{sorted(said.keys() ^ taken)}")
     for key in said:
         value = getattr(defaults, field_of(key, type(defaults)))
         if type(value) in (int, float):

@@ -252,7 +252,10 @@ def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over()
     elsewhere = {"not_identified", "taken_for_slip", "changed_or_drifted",
                  "nonorthogonality", "scale_difference", "bending_x", "bending_y",
                  "add_views", "or_add_views", "add_views_or_fewer_nodes"}
-    assert made | elsewhere == {*SENTENCES, *OF_OBSERVABILITY, "rest_not_identified"}
+    sentences = {*SENTENCES, *OF_OBSERVABILITY, "rest_not_identified"}
+    unsaid, unused = (made | elsewhere) - sentences, sentences - made - elsewhere
+    assert not unsaid, f"add to SENTENCES in reporting/words/findings.py: {sorted(unsaid)}"
+    assert not unused, f"no Finding has these names, remove their sentences: {sorted(unused)}"
     with pytest.raises(KeyError, match="no words for unheard"):
         sentence_of(Finding("unheard"))
     with pytest.raises(KeyError, match="unheard"):
