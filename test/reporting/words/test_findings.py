@@ -11,12 +11,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.causes import Explanation, cause_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Noise, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Remedy, Verdict
 from selfcal_ros.reporting.words.findings import (
+    _ACTIONS,
+    _CAUSES,
     SENTENCES,
     advice,
     remedies,
@@ -240,6 +243,12 @@ FINDINGS = [
                          ids=[found.name for found, _ in [*CAUSES, *FINDINGS]])
 def test_a_finding_in_words(found, text):
     assert sentence_of(found) == text
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_effect_of_the_package_has_its_sentence_and_remedy(name):
+    for table, words in (("_CAUSES", _CAUSES), ("_ACTIONS", _ACTIONS)):
+        assert name in words, f"add '{name}' to {table} in reporting/words/findings.py"
 
 
 def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over():
