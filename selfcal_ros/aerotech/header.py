@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from selfcal_ros.aerotech.model import CalFindings, Kind, Unit, UnitWord
+from selfcal_ros.aerotech.model import CalFindings, TableKind, Unit, UnitWord
 
 LIMIT = 1e15
 """Largest valid length, angle or count."""
@@ -106,8 +106,8 @@ class Keyword:
 _UNITS = {"POSUNIT": Keyword("pos_unit", unit), "CORUNIT": Keyword("cor_unit", unit)}
 _NEGCOR = {"NEGCOR": Keyword("negcor", None)}
 _GALVO = {**_UNITS, **_NEGCOR, "OUTAXIS3": Keyword("outaxis3", integer)}
-KEYWORDS: dict[Kind, dict[str, Keyword]] = {
-    Kind.ONE_D: {
+KEYWORDS: dict[TableKind, dict[str, Keyword]] = {
+    TableKind.ONE_D: {
         "REFERENCEAXIS": Keyword("reference_axis", integer),
         **_UNITS,
         "SAMPLEDIST": Keyword("sample_dist", number),
@@ -123,7 +123,7 @@ KEYWORDS: dict[Kind, dict[str, Keyword]] = {
         "FULLTRAVEL": Keyword("full_travel", number),
         "SERIALNUMBER": Keyword("serial_number", serial),
     },
-    Kind.TWO_D: {
+    TableKind.TWO_D: {
         **_GALVO,
         "OFFSETROW": Keyword("offset_row", number),
         "OFFSETCOL": Keyword("offset_col", number),
@@ -133,18 +133,18 @@ KEYWORDS: dict[Kind, dict[str, Keyword]] = {
         "ROLLOVERCOL": Keyword("rollover_col", number),
         "SERIALNUMBER": Keyword("serial_number", serial),
     },
-    Kind.GALVO: _GALVO,
+    TableKind.GALVO: _GALVO,
 }
 ALIASES = {f"PRIMARYABSOLUTEFEEDBACKOFFSET{end}": f"ABSOLUTEFEEDBACKOFFSET{end}"
            for end in ("", "ROW", "COL")}
 """Other names, from the manufacturer's parameter pages."""
 ALL_KEYWORDS = set().union(*KEYWORDS.values())
-POSITIONAL: dict[Kind, tuple[str, ...]] = {
-    Kind.ONE_D: ("axis_index",),
-    Kind.TWO_D: ("RowAxis", "ColumnAxis", "OutputAxis1", "OutputAxis2", "SampDistRow",
+POSITIONAL: dict[TableKind, tuple[str, ...]] = {
+    TableKind.ONE_D: ("axis_index",),
+    TableKind.TWO_D: ("RowAxis", "ColumnAxis", "OutputAxis1", "OutputAxis2", "SampDistRow",
                  "SampDistCol", "NumCols"),
 }
-POSITIONAL[Kind.GALVO] = POSITIONAL[Kind.TWO_D]
+POSITIONAL[TableKind.GALVO] = POSITIONAL[TableKind.TWO_D]
 
 
 _WORD = re.compile(r"""[ \t]*(?:
@@ -157,7 +157,7 @@ _POSITION = re.compile(r"[+\-.\d]")
 class Header:
     """Content of the start lines of one table."""
 
-    kind: Kind
+    kind: TableKind
     line: int
     positional: list[float] = field(default_factory=list)
     values: dict[str, Any] = field(default_factory=dict)
@@ -165,7 +165,7 @@ class Header:
     broken: bool = False
 
 
-def read_header(kind: Kind, heads: list[tuple[int, str]], findings: CalFindings) -> Header:
+def read_header(kind: TableKind, heads: list[tuple[int, str]], findings: CalFindings) -> Header:
     """Return the arguments on the start lines `heads` (line number, text after the token)."""
     header = Header(kind, heads[0][0])
     for index, (line, text) in enumerate(heads):

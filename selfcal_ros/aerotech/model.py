@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 
-class Kind(StrEnum):
+class TableKind(StrEnum):
     """Kind of a table; a file contains tables of one kind only."""
 
     ONE_D = "1D"
@@ -19,7 +19,8 @@ class Kind(StrEnum):
     @property
     def start(self) -> str:
         """The token that opens a table of this kind."""
-        return {Kind.ONE_D: ":START", Kind.TWO_D: ":START2D", Kind.GALVO: ":GALVO2D"}[self]
+        return {TableKind.ONE_D: ":START", TableKind.TWO_D: ":START2D",
+                TableKind.GALVO: ":GALVO2D"}[self]
 
 
 class Severity(StrEnum):
@@ -131,7 +132,7 @@ class Table1D:
     line: int = 0
     lines: dict[str, int] = field(default_factory=dict)
 
-    kind = Kind.ONE_D
+    kind = TableKind.ONE_D
 
     @property
     def reference(self) -> int:
@@ -205,9 +206,9 @@ class Table2D:
     lines: dict[str, int] = field(default_factory=dict)
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> TableKind:
         """Kind of the table."""
-        return Kind.GALVO if self.galvo else Kind.TWO_D
+        return TableKind.GALVO if self.galvo else TableKind.TWO_D
 
     @property
     def outputs(self) -> tuple[int, ...]:

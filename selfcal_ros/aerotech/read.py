@@ -19,14 +19,14 @@ MAX_TABLES = 1000
 _NUMERIC = re.compile(r"[0-9eE+\-. \t]*")
 _NUMBER_FIRST = re.compile(r"[+\-.]?\d")
 _TOKEN = re.compile(r":([A-Za-z0-9_]*)")
-_STARTS = {kind.start[1:]: kind for kind in model.Kind}
+_STARTS = {kind.start[1:]: kind for kind in model.TableKind}
 
 
 @dataclass
 class _Open:
     """A table between its first start line and its end."""
 
-    kind: model.Kind
+    kind: model.TableKind
     heads: list[tuple[int, str]]
     words: list[str] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
@@ -43,7 +43,7 @@ class _Reader:
         self.tables: list[model.Table] = []
         self.comments: list[str] = []
         self.first_start = 0
-        self.first_kind: model.Kind | None = None
+        self.first_kind: model.TableKind | None = None
         self.n_tables = 0
         self.open: _Open | None = None
 
@@ -128,7 +128,7 @@ class _Reader:
             self.findings.error(line, f"unknown token {short(text.split()[0])}",
                                 "known are :START, :START2D, :GALVO2D and :END")
 
-    def _start(self, line: int, kind: model.Kind, rest: str) -> None:
+    def _start(self, line: int, kind: model.TableKind, rest: str) -> None:
         if rest and rest[0] not in " \t":
             self.findings.error(line, f"no blank after {kind.start}", "put one")
         if self.open is not None and not self.open.counts:
@@ -185,7 +185,7 @@ class _Reader:
         header = read_header(table.kind, table.heads, self.findings)
         header.broken |= table.broken_head
         values = _numbers(table, self.findings) if not table.broken else None
-        make = _table_1d if table.kind is model.Kind.ONE_D else _table_2d
+        make = _table_1d if table.kind is model.TableKind.ONE_D else _table_2d
         made = make(header, values, (table.lines, table.counts), self.findings)
         if made is not None:
             self.tables.append(made)
@@ -247,7 +247,7 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
         return None
     return model.Table2D(row, column, outputs, sample_row, sample_col,
                          values.reshape(-1, columns, len(outputs)), **header.values,
-                         galvo=header.kind is model.Kind.GALVO, line=header.line,
+                         galvo=header.kind is model.TableKind.GALVO, line=header.line,
                          lines=header.lines)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.aerotech.header import LIMIT, SMALLEST
-from selfcal_ros.aerotech.model import CalFindings, Kind, Table, Table1D, Table2D, UnitWord
+from selfcal_ros.aerotech.model import CalFindings, Table, Table1D, Table2D, TableKind, UnitWord
 
 MAX_AXIS = 32
 MAX_1D_TABLES = 100
@@ -179,7 +179,7 @@ def _gi4(table: Table2D, findings: CalFindings, gi4: Gi4) -> None:
                            f"a protocol of {gi4.bits} bits needs {want:.9g}, 1/64 of its range")
 
 
-def mixed_kinds(line: int, kinds: tuple[Kind, Kind], findings: CalFindings) -> None:
+def mixed_kinds(line: int, kinds: tuple[TableKind, TableKind], findings: CalFindings) -> None:
     """Record a table of another kind than the first one of its file."""
     findings.error(line, f"a {kinds[0]} table in a file of {kinds[1]} tables",
                    "put each kind into a file of its own")
@@ -187,7 +187,7 @@ def mixed_kinds(line: int, kinds: tuple[Kind, Kind], findings: CalFindings) -> N
 
 def check_counts(tables: Sequence[Table], findings: CalFindings) -> None:
     """Add a finding for every exceeded limit on the number of tables."""
-    limits = {Kind.ONE_D: MAX_1D_TABLES, Kind.TWO_D: MAX_2D_TABLES}
+    limits = {TableKind.ONE_D: MAX_1D_TABLES, TableKind.TWO_D: MAX_2D_TABLES}
     for kind, limit in limits.items():
         same = [table for table in tables if table.kind is kind]
         if len(same) > limit:

@@ -15,7 +15,7 @@ from selfcal_ros.compensation.residual import Correction, Residual, plane_residu
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.reporting.chapters import Chapter, Figure
+from selfcal_ros.reporting.chapters import CaptionedFigure, Chapter
 from selfcal_ros.reporting.figures import parts
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.summary.numbers import fixed_column, significant
@@ -51,7 +51,7 @@ def turned(stage: Compensator, frame: MachineFrame, theta_rad: ArrayLike,
 
 
 @dataclass(frozen=True, eq=False)
-class Verification:
+class TableVerification:
     """Residuals at the sites, between them, and at the angular lines; None if not requested."""
 
     frame: MachineFrame
@@ -72,7 +72,7 @@ class Verification:
 
 
 def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
-                  active: Correction | None = None) -> Verification:
+                  active: Correction | None = None) -> TableVerification:
     """Return the residuals of a stage with this error map and `tables`.
 
     `active` is the table that was loaded during the calibration, if any; see `plane_residuals`.
@@ -98,7 +98,7 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
         between = rest[0] if rest else None
     if theta:
         lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
-    return Verification(frame, sites, between, lines)
+    return TableVerification(frame, sites, between, lines)
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
@@ -145,7 +145,7 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
                  for which in BEFORE_AND_AFTER]
         rows.append((PLACES[residual.place], *fixed_column(sizes, 4), unit))
     header = ("error", "rms before", "after", "largest before", "after", "unit")
-    figure = Figure(controller_figure(found),
+    figure = CaptionedFigure(controller_figure(found),
                     "A simulated controller moves to the nodes and to the middle of every cell, "
                     "without and with the exported table. What remains between the nodes is the "
                     "controller's linear interpolation.")
@@ -154,7 +154,7 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     return Chapter(TITLE, (figure,), (leaves,))
 
 
-def controller_figure(found: Verification) -> Drawing:
+def controller_figure(found: TableVerification) -> Drawing:
     """Return the error of the controller, true − commanded, before and after at one scale."""
     drawing = parts.titled("before-after",
                            "Controller: true − commanded, without its constant shift")

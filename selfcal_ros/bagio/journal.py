@@ -28,7 +28,7 @@ from selfcal_ros.bagio.journal_file import (
     scan_file,
 )
 from selfcal_ros.bagio.schemas import ChannelDecoder, definition_of, store_of_schema
-from selfcal_ros.bagio.writer import Closing, Metadata, Topic, writing
+from selfcal_ros.bagio.writer import BagTopic, Closing, Metadata, writing
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.messages.to_model import stamp_ns
@@ -261,10 +261,10 @@ class Journal(Closing):
             return
         definition_of(topic, typename)  # refuses an unknown type
         known = self._metadata.topics.setdefault(
-            topic, Topic(typename, list(qos), heard_on=heard_on))
+            topic, BagTopic(typename, list(qos), heard_on=heard_on))
         self._declare(topic, known)
 
-    def _declare(self, topic: str, known: Topic) -> None:
+    def _declare(self, topic: str, known: BagTopic) -> None:
         number, definition = len(self._channels) + 1, definition_of(topic, known.type)
         schema = Schema(id=number, name=known.type, encoding="ros2msg", data=definition.encode())
         channel = Channel(
@@ -377,7 +377,7 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
             schema = content.schemas.get(channel.schema_id)
             if schema is not None:
                 qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
-                topic = metadata.topics.setdefault(channel.topic, Topic(
+                topic = metadata.topics.setdefault(channel.topic, BagTopic(
                     schema.name, qos, heard_on=channel.metadata.get("heard_on", "")))
                 topic.count += content.counts.get(channel.id, 0)
         commands += _commands(content, str(file))

@@ -17,7 +17,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Header, McapRecord, Schema, Statistics
 
-from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC, Block, message_block, stretch
+from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC, MessageBlock, message_block, stretch
 from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
 from selfcal_ros.bagio.writer import FileEntry
 from selfcal_ros.outputs import sync_folder
@@ -231,7 +231,7 @@ def _next_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
     return HEAD.unpack(head) if len(head) == HEAD.size else None
 
 
-def _count(content: Content, block: Block, keep: str) -> None:
+def _count(content: Content, block: MessageBlock, keep: str) -> None:
     """Count the messages of a block, and keep the requested ones."""
     for number in block.channels():
         part = block[block.fronts["channel"] == number]

@@ -50,7 +50,7 @@ JOINT = MAGIC + bytes([Opcode.HEADER])
 
 
 @dataclass(frozen=True)
-class Block:
+class MessageBlock:
     """Messages in one buffer, in their order.
 
     Attributes
@@ -76,9 +76,9 @@ class Block:
             return numbers
         return sorted(numbers, key=lambda number: int((column == number).argmax()))
 
-    def __getitem__(self, which: np.ndarray) -> "Block":
+    def __getitem__(self, which: np.ndarray) -> "MessageBlock":
         """Return some of the messages."""
-        return Block(self.fronts[which], self.payloads[which])
+        return MessageBlock(self.fronts[which], self.payloads[which])
 
     def compressed(self) -> np.ndarray:
         """Return the messages that begin like a zstd frame, int64 (k,)."""
@@ -100,29 +100,29 @@ class Block:
                           publish_time=publish_time, data=data)
 
 
-def block_of(messages: list[Message]) -> Block:
+def block_of(messages: list[Message]) -> MessageBlock:
     """Return single messages as one block."""
     fronts = np.zeros(len(messages), dtype=FRONT_TYPE)
     for name, attribute in (("channel", "channel_id"), ("sequence", "sequence"),
                             ("log_time", "log_time"), ("publish_time", "publish_time")):
         fronts[name] = [getattr(message, attribute) for message in messages]
-    return Block(fronts, Payloads.joined([message.data for message in messages]))
+    return MessageBlock(fronts, Payloads.joined([message.data for message in messages]))
 
 
-def message_block(data: bytes, at: int) -> tuple[Block, int]:
+def message_block(data: bytes, at: int) -> tuple[MessageBlock, int]:
     """Return the consecutive messages from `at` on, and their end."""
     places = _Places(data)
     end = places.find(at)
     start = np.concatenate([*places.parts, np.array(places.single, dtype=np.int64)])
     if not len(start):
-        return Block(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
+        return MessageBlock(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
     fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[start].view(
         FRONT_TYPE)
     length = fronts["length"].astype(np.int64) - mcap_salvage.MESSAGE_FRONT
-    return Block(fronts, Payloads(data, start + FRONT, length)), end
+    return MessageBlock(fronts, Payloads(data, start + FRONT, length)), end
 
 
-def stretch(file: BinaryIO, at: int, size: int) -> tuple[Block | None, int]:
+def stretch(file: BinaryIO, at: int, size: int) -> tuple[MessageBlock | None, int]:
     """Return the messages outside chunks from `at` on and their end, or None.
 
     Nothing is read from byte `size` on, nor from where a file that was joined to it begins.
@@ -198,7 +198,7 @@ def _period(sizes: np.ndarray) -> np.ndarray:
     return sizes[:0]
 
 
-def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
+def chunk_items(chunk: Chunk) -> list[MessageBlock | Schema | Channel]:
     """Return the content of a chunk in its order, consecutive messages as one block.
 
     Raises
@@ -220,11 +220,11 @@ def chunk_items(chunk: Chunk) -> list[Block | Schema | Channel]:
     except Exception:  # left to the library's reader
         chunk.data, chunk.compression = data, ""
         return [item for item in gathered(breakup_chunk(chunk))
-                if isinstance(item, Block | Schema | Channel)]
+                if isinstance(item, MessageBlock | Schema | Channel)]
 
 
-def _items(data: bytes) -> list[Block | Schema | Channel]:
-    items: list[Block | Schema | Channel] = []
+def _items(data: bytes) -> list[MessageBlock | Schema | Channel]:
+    items: list[MessageBlock | Schema | Channel] = []
     at = 0
     while at < len(data):
         block, at = message_block(data, at)
@@ -245,9 +245,9 @@ def _items(data: bytes) -> list[Block | Schema | Channel]:
     return items
 
 
-def gathered(records: list[McapRecord]) -> list[Block | McapRecord]:
+def gathered(records: list[McapRecord]) -> list[MessageBlock | McapRecord]:
     """Return records with consecutive messages as one block."""
-    items: list[Block | McapRecord] = []
+    items: list[MessageBlock | McapRecord] = []
     messages: list[Message] = []
     for record in records:
         if isinstance(record, Message):

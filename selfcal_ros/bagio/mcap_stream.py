@@ -95,7 +95,7 @@ class McapStream:
             for message in block.messages():
                 yield self.channels[message.channel_id], message
 
-    def blocks(self) -> Iterator[mcap_chunk.Block]:
+    def blocks(self) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield all readable messages of declared channels in blocks.
 
         Declarations between two blocks are in `schemas` and `channels` when the second one
@@ -157,7 +157,7 @@ class McapStream:
         if self._needless:
             self.schemas, self.channels = summary.schemas, summary.channels
 
-    def _records(self, file: BinaryIO) -> Iterator[mcap_chunk.Block]:
+    def _records(self, file: BinaryIO) -> Iterator[mcap_chunk.MessageBlock]:
         """Go from record to record; records that begin before `sure` have been read."""
         size = self._size
         at = sure = clean = self.begin + len(mcap_chunk.MAGIC)
@@ -222,7 +222,7 @@ class McapStream:
         return self._size
 
     def _chunk(self, file: BinaryIO, chunk: Chunk, place: tuple[int, int],
-               ) -> Iterator[mcap_chunk.Block]:
+               ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the messages of a chunk between two bytes of the file."""
         start, position = place
         try:
@@ -243,7 +243,8 @@ class McapStream:
         for item in items:
             yield from self._take(item)
 
-    def _take(self, item: McapRecord | mcap_chunk.Block) -> Iterator[mcap_chunk.Block]:
+    def _take(self, item: McapRecord | mcap_chunk.MessageBlock
+              ) -> Iterator[mcap_chunk.MessageBlock]:
         if isinstance(item, Schema):
             self.schemas[item.id] = item
         elif isinstance(item, Channel):
@@ -252,13 +253,13 @@ class McapStream:
             self._n_written = item.message_count
         elif isinstance(item, Message):
             yield from self._take(mcap_chunk.block_of([item]))
-        elif isinstance(item, mcap_chunk.Block):
+        elif isinstance(item, mcap_chunk.MessageBlock):
             self._n_read += len(item)
             block = self._decompressed(self._declared(item))
             if len(block):
                 yield block
 
-    def _declared(self, block: mcap_chunk.Block) -> mcap_chunk.Block:
+    def _declared(self, block: mcap_chunk.MessageBlock) -> mcap_chunk.MessageBlock:
         """Return the messages of declared channels; the others are counted."""
         missing = [number for number in block.channels() if number not in self.channels]
         if not missing:
@@ -267,7 +268,7 @@ class McapStream:
             self._undeclared[number] += int((block.fronts["channel"] == number).sum())
         return block[~np.isin(block.fronts["channel"], missing)]
 
-    def _decompressed(self, block: mcap_chunk.Block) -> mcap_chunk.Block:
+    def _decompressed(self, block: mcap_chunk.MessageBlock) -> mcap_chunk.MessageBlock:
         """Return the messages with payloads compressed by rosbag2 decompressed.
 
         A payload that cannot be decompressed is unchanged: decoding it will fail, too.
@@ -287,7 +288,7 @@ class McapStream:
                 keep[number] = False
             except zstandard.ZstdError:
                 pass
-        return mcap_chunk.Block(block.fronts, Payloads.joined(payloads))[keep]
+        return mcap_chunk.MessageBlock(block.fronts, Payloads.joined(payloads))[keep]
 
     def _say_end(self, file: BinaryIO, data_ended: bool) -> None:
         self.lost.append(
@@ -318,7 +319,7 @@ class McapStream:
                     self.channels.setdefault(record.id, record)
 
     def _salvage(self, file: BinaryIO, start: int,
-                 error: Exception) -> Iterator[mcap_chunk.Block]:
+                 error: Exception) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the readable part of the record at `start`, and report the rest."""
         stop, size = self._found(file, start), self._size
         file.seek(start)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Channel
 
-from selfcal_ros.bagio.mcap_chunk import Block
+from selfcal_ros.bagio.mcap_chunk import MessageBlock
 from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream, streams
 from selfcal_ros.bagio.schemas import (
     ChannelDecoder,
@@ -20,7 +20,7 @@ from selfcal_ros.bagio.schemas import (
     shorter_stores,
     store_of_schema,
 )
-from selfcal_ros.collection.clock_steps import Step, StepWatch, future_lines
+from selfcal_ros.collection.clock_steps import ClockStep, StepWatch, future_lines
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
@@ -73,7 +73,7 @@ class BagReader:
     clock_limit_s: float = CLOCK_LIMIT_S
     leave_ahead: bool = False
     lost: list[str] = field(default_factory=list)
-    steps: dict[str, list[Step]] = field(default_factory=dict)
+    steps: dict[str, list[ClockStep]] = field(default_factory=dict)
     ahead: Counter = field(default_factory=Counter)
     cells: set[str] = field(default_factory=set)
     topics: dict[str, str] = field(default_factory=dict)
@@ -189,7 +189,7 @@ class BagReader:
                 yield queue.decoder.role, item
         self._say(bad)
 
-    def _streams(self) -> Iterator[tuple[McapStream, Block]]:
+    def _streams(self) -> Iterator[tuple[McapStream, MessageBlock]]:
         """Yield the blocks of all files; an unreadable file is skipped if another is readable."""
         refused: list[InputError] = []
         for file in self.files:
@@ -210,7 +210,7 @@ class BagReader:
             raise refused[0]
 
     def _blocks(self, bad: Counter,
-                ) -> Iterator[tuple[Block, list[tuple[ChannelDecoder, np.ndarray]]]]:
+                ) -> Iterator[tuple[MessageBlock, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
         watches = self._watches()
         decoders: dict[tuple[Path, int, int], ChannelDecoder | None] = {}
@@ -243,7 +243,7 @@ class BagReader:
     def _watches(self) -> dict[str, StepWatch]:
         return {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
 
-    def _in_time(self, role: str, block: Block, index: np.ndarray) -> np.ndarray:
+    def _in_time(self, role: str, block: MessageBlock, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""
         self._n_commands += len(index) * (role == COMMAND_TOPIC)
         if role == ENCODER_TOPIC and not _ahead(block, index[::_stride(index)]).any():
@@ -254,7 +254,7 @@ class BagReader:
         self.ahead[role] += int(ahead.sum())
         return index[~ahead] if self.leave_ahead else index
 
-    def _note_steps(self, watch: StepWatch, role: str, block: Block) -> None:
+    def _note_steps(self, watch: StepWatch, role: str, block: MessageBlock) -> None:
         stamps, there = first_stamps_ns(block.payloads)
         found = watch.add(stamps, block.fronts["log_time"][there].astype(np.int64))
         self.steps.setdefault(role, []).extend(found)
@@ -316,7 +316,7 @@ def _stride(index: np.ndarray) -> int:
     return max(1, len(index) // LOOKED_AT)
 
 
-def _ahead(block: Block, index: np.ndarray) -> np.ndarray:
+def _ahead(block: MessageBlock, index: np.ndarray) -> np.ndarray:
     """Return which messages are stamped ahead of their log time."""
     stamps, there = first_stamps_ns(block.payloads[index])
     ahead = np.zeros(len(index), dtype=bool)

@@ -89,7 +89,7 @@ class Closing(ABC):
 
 
 @dataclass
-class Topic:
+class BagTopic:
     """One topic of a bag: type, offered QoS, and number of messages.
 
     `heard_on` is the name that it was remapped to; empty = its own. `hash` is the hash of its type,
@@ -140,7 +140,7 @@ class FileEntry:
 class Metadata:
     """Content of metadata.yaml."""
 
-    topics: dict[str, Topic] = field(default_factory=dict)
+    topics: dict[str, BagTopic] = field(default_factory=dict)
     files: list[FileEntry] = field(default_factory=list)
 
     def write(self, folder: Path) -> None:
@@ -231,7 +231,7 @@ class BagWriter(Closing):
         if typename not in self._schemas:
             self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
                                                                  definition.encode())
-        self._metadata.topics[topic] = declared = Topic(typename, qos, heard_on=heard_on)
+        self._metadata.topics[topic] = declared = BagTopic(typename, qos, heard_on=heard_on)
         self._channels[topic] = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename], declared.channel_metadata())
 
@@ -240,7 +240,7 @@ class BagWriter(Closing):
         name = schema.name if schema else ""
         number = self._mcap.register_schema(name, schema.encoding, schema.data) if schema else 0
         about = dict(channel.metadata)
-        self._metadata.topics.setdefault(channel.topic, Topic(
+        self._metadata.topics.setdefault(channel.topic, BagTopic(
             name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)))
         return self._mcap.register_channel(channel.topic, channel.message_encoding, number, about)
 

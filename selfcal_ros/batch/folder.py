@@ -96,7 +96,7 @@ def _entries(folder: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Settings:
+class BatchSettings:
     """Settings for every bag of a batch.
 
     Attributes
@@ -120,12 +120,12 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """A bag to be solved into the folder of a batch; `redo`: even if solved before."""
 
     bag: Path
     folder: Path
-    settings: Settings
+    settings: BatchSettings
     redo: bool = False
 
 
@@ -174,7 +174,7 @@ def opened(folder: Path) -> Iterator[None]:
         yield
 
 
-def kept_records(folder: Path, settings: Settings) -> list[Record]:
+def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:
     """Return the records of these settings in the folder."""
     digest = settings.digest()
     found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))

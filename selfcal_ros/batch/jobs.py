@@ -26,7 +26,7 @@ from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
-def run_job(job: folder.Job) -> folder.Record:
+def run_job(job: folder.BatchJob) -> folder.Record:
     """Return the record of a bag: the existing one if allowed, or that of a new solution.
 
     An unusable bag has a record, too, with the exit code and the line of `selfcal
@@ -66,7 +66,7 @@ def run_job(job: folder.Job) -> folder.Record:
     return record
 
 
-def solved(job: folder.Job, source: dict[str, str],
+def solved(job: folder.BatchJob, source: dict[str, str],
            ) -> tuple[results.CalibrationResult, NotIdentifiableError | None]:
     """Return the result of a bag, as from `selfcal solve`, and the reason if it has no map."""
     settings = job.settings

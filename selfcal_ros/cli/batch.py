@@ -10,9 +10,9 @@ from typing import Any
 
 from selfcal_ros.batch.course import compared, sentence
 from selfcal_ros.batch.folder import (
-    Job,
+    BatchJob,
+    BatchSettings,
     Record,
-    Settings,
     done_and_to_do,
     find_bags,
     kept_records,
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
                          f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
     baseline = read_result(args.baseline) if args.baseline else None
-    settings = Settings(*parameters(args), args.namespace)
+    settings = BatchSettings(*parameters(args), args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
         if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
@@ -95,13 +95,13 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(records)
 
 
-def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "Settings",
+def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSettings",
             places: Sequence[int]) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
     folder = Path(args.output).absolute()
-    jobs = [Job(bags[place], folder, settings, args.redo) for place in places]
+    jobs = [BatchJob(bags[place], folder, settings, args.redo) for place in places]
     with late_progress("solving bags") as progress:
         for outcome in outcomes(run_job, jobs, workers=workers, dask=args.dask or ""):
             place = places[outcome.index]

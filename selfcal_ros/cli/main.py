@@ -51,7 +51,7 @@ def build_parser(only: str | None = None) -> "Parser":
 
     If it is not one, no verb is imported: their names and help are known without.
     """
-    parser = Front(prog="selfcal", description="Calibrates XY-theta stages from readings of a "
+    parser = AllVerbs(prog="selfcal", description="Calibrates XY-theta stages from readings of a "
                    "plate in several views, and states the uncertainty of every number.",
                    epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not "
                    "identify the stage, 4 no usable data, 5 written but not qualified, 1 internal "
@@ -234,7 +234,7 @@ class Parser(argparse.ArgumentParser):
         raise argparse.ArgumentError(None, f"{_name_of(action)} '{value}' is unknown; {hint}")
 
 
-class Front(Parser):
+class AllVerbs(Parser):
     """The parser of all verbs: its help has them in groups."""
 
     def format_help(self) -> str:

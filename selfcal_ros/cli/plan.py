@@ -26,7 +26,7 @@ from selfcal_ros.estimation.observability.resistance import (
 )
 from selfcal_ros.estimation.observability.suggest import (
     Against,
-    Score,
+    PlanScore,
     Suggestion,
     best_plan,
     rank_next,
@@ -343,7 +343,7 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 
 
-def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float | None],
+def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[PlanScore, float | None],
                  ranked: Sequence[Suggestion]) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
     unit = now[1]
@@ -361,7 +361,7 @@ def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[Score, float |
         *(f"  {_score_text(item.score, unit)}   {step_text(item, plan)}" for item in ranked)]))
 
 
-def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float | None],
+def _show_best(args: argparse.Namespace, best: Plan, score: tuple[PlanScore, float | None],
                how: str) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
@@ -376,7 +376,7 @@ def _show_best(args: argparse.Namespace, best: Plan, score: tuple[Score, float |
     tell(_score_text(*score))
 
 
-def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
+def _score_json(score: PlanScore, noise_m: float | None) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
@@ -388,7 +388,7 @@ def _score_json(score: Score, noise_m: float | None) -> dict[str, Any]:
     return out
 
 
-def _score_text(score: Score, noise_m: float | None) -> str:
+def _score_text(score: PlanScore, noise_m: float | None) -> str:
     if score.deficiency:
         return counted(score.deficiency, "undetermined mode")
     theta = f"  theta rms {score.rms_theta:.3f}" if score.rms_theta else ""

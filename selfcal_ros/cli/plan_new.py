@@ -37,7 +37,7 @@ from selfcal_ros.machine.visiting import stops
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_to_dict, view_to_dict
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
@@ -263,14 +263,14 @@ def _check_offset_m(artifact: Artifact) -> float:
     return min(CHECK_OFFSET_M, MOST_CHECK_OFFSET * artifact.grid_pitch_m)
 
 
-def _image(known: Known) -> Image | None:
+def _image(known: Known) -> ImageCells | None:
     """Return the cells that the camera sees; None for a single mark."""
     counts = []
     for side, marks in zip(known.field, known.marks, strict=True):
         shown = min(int(side / known.pitch * (1 + 1e-9)), marks)  # 0.6 mm are 3 pitches of 0.2 mm
         counts.append(max(1, shown - 1 + shown % 2))
     nx, ny = counts
-    return Image(nx, ny, known.pitch) if nx * ny > 1 else None
+    return ImageCells(nx, ny, known.pitch) if nx * ny > 1 else None
 
 
 def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:

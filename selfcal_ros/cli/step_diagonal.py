@@ -22,7 +22,13 @@ from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, reading
 from selfcal_ros.laser.profiles import ReferenceLine, axis_corrections
 from selfcal_ros.laser.report import outcome, profiles_figure, summary, truth_of
 from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
-from selfcal_ros.laser.table import Columns, dimension_of, read_table, table_text, write_table
+from selfcal_ros.laser.table import (
+    RequiredColumns,
+    dimension_of,
+    read_table,
+    table_text,
+    write_table,
+)
 from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
 from selfcal_ros.outputs import check_outputs, write_json, write_text
 from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
@@ -185,7 +191,7 @@ def _measurement(args: argparse.Namespace) -> tuple:
                             "position_topic", "joints", "rest_tolerance", "min_rest", "settle"),
                      f"it is for bags, and {args.data} is a table", "omit it")
         dim = dimension_of(args.data)
-        columns = Columns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
+        columns = RequiredColumns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
         data, warnings = read_table(args.data, columns)
     return data, warnings, {"file": args.data, "sha256": sha256_of(args.data)}
 

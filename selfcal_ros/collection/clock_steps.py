@@ -25,7 +25,7 @@ Span = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Step:
+class ClockStep:
     """A step of a clock.
 
     Attributes
@@ -62,7 +62,7 @@ class StepWatch:
         self._nearest: tuple[int, int] | None = None  # largest offset, and its time
         self._quiet = 0  # groups still affected by a reported step
 
-    def add(self, stamps_ns: np.ndarray, received_ns: np.ndarray) -> list[Step]:
+    def add(self, stamps_ns: np.ndarray, received_ns: np.ndarray) -> list[ClockStep]:
         """Take messages in the order of reception; return the steps found.
 
         Parameters
@@ -84,7 +84,7 @@ class StepWatch:
         self._groups = self._groups[:, -2 * BESIDE:]
         return found
 
-    def _look(self) -> list[Step]:
+    def _look(self) -> list[ClockStep]:
         """Return the steps within a group with neighbours on both sides."""
         count = self._groups.shape[1] - 2 * BESIDE
         if count <= 0:
@@ -107,7 +107,7 @@ class StepWatch:
                 # of the groups affected, the middle one contains the step
                 last = min(number + BESIDE, count)
                 best = number + int(np.abs(size[number:last]).argmax())
-                out.append(Step(int(before[1][1, best]), int(size[best])))
+                out.append(ClockStep(int(before[1][1, best]), int(size[best])))
                 self._quiet = 2 * BESIDE
                 self._nearest = nearest + int(size[best]), when
         return out
@@ -149,7 +149,7 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     return np.where(ahead | back, by, np.where(together, stamps, 0))
 
 
-def step_lines(steps: Mapping[str, Iterable[Step]], timeline: Timeline) -> list[str]:
+def step_lines(steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline) -> list[str]:
     """Return one line for each step: clock, amount, location, consequence.
 
     Parameters
@@ -177,12 +177,12 @@ def future_lines(topics: Collection[str]) -> list[str]:
             "ahead of its reception was not used; set the clock that stamps it"] if topics else []
 
 
-def _alike(one: Step, other: Step) -> bool:
+def _alike(one: ClockStep, other: ClockStep) -> bool:
     return (abs(one.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
             and abs(one.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000)
 
 
-def _line(topics: str, step: Step, timeline: Timeline) -> str:
+def _line(topics: str, step: ClockStep, timeline: Timeline) -> str:
     index = int(timeline.assign(np.array([step.before_ns]))[0])
     view = timeline.intervals[index].view_index if index >= 0 else None
     where = "between views" if view is None else f"in view '{timeline.views[view].name}'"

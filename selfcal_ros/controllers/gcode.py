@@ -49,7 +49,7 @@ MAX_WORDS, MAX_LINE, MAX_COMMENT = 79, 255, 200
 
 
 @dataclass
-class Line:
+class ProgramLine:
     """A line as it was read.
 
     Attributes
@@ -165,14 +165,14 @@ class Rewriter:
     def _refuse(self, what: str, mend: str) -> NoReturn:
         raise InputError(self._where, what, mend)
 
-    def _read(self, text: str) -> Line:
+    def _read(self, text: str) -> ProgramLine:
         """Return the codes, words and comments of a line."""
         pattern = PRINTER_WORD if self._printer else WORD
         left = pattern.sub("", text)
         if left:
             self._refuse(f"{left[0]!r} does not belong to a word of {self.dialect}",
                          remedy(left[0].upper()))
-        line = Line([], {}, [])
+        line = ProgramLine([], {}, [])
         for letter, value, comment in pattern.findall(text):
             letter = letter.upper()
             if comment:
@@ -202,7 +202,7 @@ class Rewriter:
             self._refuse(f"{letter}{value} is not understood by all firmware", f"write {name}")
         return self._codes[name]
 
-    def _check(self, line: Line) -> None:
+    def _check(self, line: ProgramLine) -> None:
         """Refuse codes that do not agree, and words that do not belong to one of them."""
         names = " ".join(code.name for code in line.codes)
         acts = [code for code in line.codes if code.does in ACTS]
@@ -230,7 +230,7 @@ class Rewriter:
         if line.code("set E") and not line.values:
             self._refuse("G92 moves the frame", remedy("G92"))
 
-    def _check_way_home(self, line: Line) -> None:
+    def _check_way_home(self, line: ProgramLine) -> None:
         """Refuse G28 and G30 by way of a point that is not where the stage is."""
         distance = line.code("distance")
         mode = distance.name if distance else self._modes.get("distance")
@@ -254,7 +254,7 @@ class Rewriter:
             self._motion = code if code.does in MOVES else None
         self._ended |= code.does == "end"
 
-    def _moved(self, act: Code, line: Line) -> list[str]:
+    def _moved(self, act: Code, line: ProgramLine) -> list[str]:
         """Return the lines of a move, each with its command."""
         relative = self._modes.get("distance") == "G91"
         for mode, moves in NEEDED.items():
@@ -286,7 +286,7 @@ class Rewriter:
         by_m83 = axis == "E" and self._modes.get("extruder") == "M83"
         return by_m83 or self._modes["distance"] == "G91"
 
-    def _corrected(self, act: Code, line: Line, ends: Mapping[str, float]) -> list[str]:
+    def _corrected(self, act: Code, line: ProgramLine, ends: Mapping[str, float]) -> list[str]:
         """Return the lines of a move in XY."""
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
@@ -315,7 +315,7 @@ class Rewriter:
                 way = line.number(axis) - start
                 place[axis] = start + way * i / (len(path_m) - 1)
             texts = {axis: self._coordinate(axis, value) for axis, value in place.items()}
-            lines.append(_text(act, line if not lines else Line([], {}, []), texts))
+            lines.append(_text(act, line if not lines else ProgramLine([], {}, []), texts))
 
         corners_m = np.stack([path_m.real, path_m.imag], axis=1)
         self.reach_m[0] = np.minimum(self.reach_m[0], corners_m.min(axis=0))
@@ -325,7 +325,7 @@ class Rewriter:
         self.pieces += len(lines)
         return lines
 
-    def _shared(self, line: Line) -> dict[str, float]:
+    def _shared(self, line: ProgramLine) -> dict[str, float]:
         """Return where the other axes of a split move start, 0 if by increments."""
         for axis in line.named("ZE"):
             self._sent[axis] = 0.0 if self._relative(axis) else self._at[axis]
@@ -372,7 +372,7 @@ class Rewriter:
         return text + "0" * text.endswith(".")
 
 
-def _text(act: Code, line: Line, places: Mapping[str, str]) -> str:
+def _text(act: Code, line: ProgramLine, places: Mapping[str, str]) -> str:
     """Return a line: its number, command and coordinates, then all else."""
     number = [f"N{line.values[letter]}" for letter in line.named("N")]
     command = "G1" if act.does == "arc" else act.name

@@ -20,7 +20,7 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.comparison.verification import corrected, require_correctable
 from selfcal_ros.estimation.joint.camera import (
-    Camera,
+    FittedCamera,
     camera_of,
     few_read,
     known_camera,
@@ -243,7 +243,8 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
     return measurements if camera is None else straightened(measurements, camera)
 
 
-def _camera(measurements: Measurements, options: Options) -> tuple[Camera | None, Measurements]:
+def _camera(measurements: Measurements,
+            options: Options) -> tuple[FittedCamera | None, Measurements]:
     """Return the camera shown by images of several marks, and the readings corrected for it."""
     straight, camera = measurements, None
     if not measurements.has_images:

@@ -27,7 +27,7 @@ BLOCK = "block"
 
 
 @dataclass(frozen=True)
-class Columns:
+class RequiredColumns:
     """Required columns of a table.
 
     Attributes
@@ -57,7 +57,7 @@ class Columns:
 
 
 def read_table(path: str | os.PathLike,
-               columns: Columns) -> tuple[laser_data.StepDiagonal, list[str]]:
+               columns: RequiredColumns) -> tuple[laser_data.StepDiagonal, list[str]]:
     """Return the measurement in a CSV file, and warnings.
 
     Raises
@@ -108,7 +108,7 @@ def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _header(path: str | os.PathLike, rows: list, columns: Columns) -> list[str]:
+def _header(path: str | os.PathLike, rows: list, columns: RequiredColumns) -> list[str]:
     line, header = rows[0]
     where = f"{path}:{line}"
     for name in header:
@@ -160,7 +160,8 @@ def _number(text: str, where: str) -> float:
     return number
 
 
-def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _values(named: dict[str, str], columns: RequiredColumns,
+            where: str) -> tuple[np.ndarray, np.ndarray]:
     """Return one row's readings (K, D) and linear errors (D,), m."""
     steps = np.array(columns.steps_m)
     nominal = steps**2 / np.linalg.norm(steps)
@@ -182,7 +183,7 @@ def _values(named: dict[str, str], columns: Columns, where: str) -> tuple[np.nda
     return readings, linear
 
 
-def _refuse_unread(rows: list[tuple[np.ndarray, np.ndarray]], columns: Columns,
+def _refuse_unread(rows: list[tuple[np.ndarray, np.ndarray]], columns: RequiredColumns,
                    where: str) -> None:
     """Refuse a block without readings of a diagonal."""
     read = np.isfinite([readings for readings, _ in rows]).any(axis=0).ravel()
@@ -200,7 +201,7 @@ def _in_order(cells: dict[int, list], path: str | os.PathLike) -> list[list]:
     return [cells[block] for block in sorted(cells)]
 
 
-def _assemble(blocks: list[list], columns: Columns) -> laser_data.StepDiagonal:
+def _assemble(blocks: list[list], columns: RequiredColumns) -> laser_data.StepDiagonal:
     repeats, dim = max(map(len, blocks)), len(columns.steps_m)
     samples = np.full((repeats, len(columns.diagonals), dim, len(blocks)), np.nan)
     linear = np.full((repeats, dim, len(blocks)), np.nan)
@@ -215,7 +216,7 @@ def _assemble(blocks: list[list], columns: Columns) -> laser_data.StepDiagonal:
 def table_text(data: laser_data.StepDiagonal, comments: Sequence[str] = ()) -> str:
     """Return a measurement as CSV text, mm, to 0.01 nm."""
     linear = data.linear_m
-    columns = Columns(data.steps_m, data.diagonals, linear is not None)
+    columns = RequiredColumns(data.steps_m, data.diagonals, linear is not None)
     out = io.StringIO()
     for comment in comments:
         out.write(f"# {comment}\n")

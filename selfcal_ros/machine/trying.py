@@ -35,7 +35,7 @@ LARGE_REVERSAL_M = 1e-6
 
 
 @dataclass(frozen=True)
-class Value:
+class FoundValue:
     """A value found, and its standard uncertainty; SI, angles of the camera in degrees."""
 
     value: float
@@ -62,7 +62,7 @@ class Findings:
     """
 
     camera: CameraPose | None
-    reversal: dict[str, Value]
+    reversal: dict[str, FoundValue]
     settling_s: float
     noise_m: float
     notes: tuple[str, ...] = ()
@@ -219,7 +219,7 @@ class Trial:
         position = at.positions[number]
         return offset - position if self.cell.sense is Sense.PLATE_MOVES else offset + position
 
-    def _reversal(self, axis: str) -> Value:
+    def _reversal(self, axis: str) -> FoundValue:
         """Return how much an approach in + direction differs from one in - direction, m."""
         number = ("x", "y").index(axis)
         told = np.zeros((2, APPROACHES))
@@ -233,7 +233,7 @@ class Trial:
         difference = told[0].mean() - told[1].mean()
         sign = -1 if self.cell.sense is Sense.PLATE_MOVES else 1
         u = math.sqrt(told.var(axis=1, ddof=1).sum() / APPROACHES)
-        return Value(float(sign * difference), float(u))
+        return FoundValue(float(sign * difference), float(u))
 
     def _settling(self) -> tuple[float, float]:
         """Return the time from which a mark stands still after a move, s, and its noise, m."""
@@ -281,7 +281,7 @@ def _to_metres(camera: CameraPose) -> Callable[[np.ndarray], np.ndarray]:
     return lambda offset: turned @ offset
 
 
-def _notes(camera: CameraPose | None, reversal: dict[str, Value]) -> Iterator[str]:
+def _notes(camera: CameraPose | None, reversal: dict[str, FoundValue]) -> Iterator[str]:
     """Yield what is implausible."""
     if camera is not None and camera.mirror:
         yield ("the image is mirrored: either the camera mirrors, or an axis counts backwards; if "

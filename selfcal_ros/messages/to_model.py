@@ -20,7 +20,7 @@ from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.marks import marks_of
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import (
     COLUMNS,
     VISIT_COLUMNS,
@@ -168,12 +168,12 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
         cell=cell_of(message))
 
 
-def _image_of(message: Any) -> Image | None:
+def _image_of(message: Any) -> ImageCells | None:
     """Return the marks that an image shows; None where it is one, as in old bags."""
     nx, ny = (int(getattr(message, name, 0)) for name in ("image_nx", "image_ny"))
     if max(nx, ny) < 2:
         return None
-    image = Image(nx, ny, float(message.image_pitch) or float(message.grid_pitch))
+    image = ImageCells(nx, ny, float(message.image_pitch) or float(message.grid_pitch))
     image.steps(artifact_of(message))
     return image
 

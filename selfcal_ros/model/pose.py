@@ -283,7 +283,7 @@ MOST_CELLS = 15
 
 
 @dataclass(frozen=True)
-class Image:
+class ImageCells:
     """Marks that an exposure shows: one in each cell around the optical axis.
 
     Attributes
@@ -375,11 +375,11 @@ def turn_in_lines(turn_rad: float, artifact: Artifact) -> float | None:
     return lines % count if math.isfinite(lines) else None
 
 
-def image_of(data: dict, artifact: Artifact, where: str) -> Image | None:
+def image_of(data: dict, artifact: Artifact, where: str) -> ImageCells | None:
     """Return the marks that an exposure shows; None if the plan says nothing, or one."""
     if not data:
         return None
     raw = checked_fields(data, where, {"nx": int, "ny": int}, {"pitch_m": (float, 0.0)})
-    image = Image(raw["nx"], raw["ny"], raw["pitch_m"] or artifact.grid_pitch_m)
+    image = ImageCells(raw["nx"], raw["ny"], raw["pitch_m"] or artifact.grid_pitch_m)
     image.steps(artifact)
     return image if len(image.cells) > 1 else None

@@ -10,7 +10,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import (
     OFF,
-    Image,
+    ImageCells,
     LatticePose,
     PlacedPose,
     Pose,
@@ -117,7 +117,7 @@ class View:
     visit_order: str = ""
     check_marks: int = 0
     check_offset_m: float = 0.0
-    image: Image | None = None
+    image: ImageCells | None = None
     cell: tuple[int, int] | None = None
 
     @property

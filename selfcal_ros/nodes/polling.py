@@ -22,7 +22,7 @@ def wake(timer: Timer) -> None:
         timer.reset()
 
 
-class Missing(NamedTuple):
+class LostMessages(NamedTuple):
     """Missing messages: lost in transport, or published while not subscribed."""
 
     lost: int
@@ -62,7 +62,7 @@ class ByTheClock:
         if self.wake is not None:
             self.wake()
 
-    def empty(self, subscription: Subscription, most: int) -> Missing:
+    def empty(self, subscription: Subscription, most: int) -> LostMessages:
         """Take waiting messages, up to `most`; return the number of skipped sequence numbers."""
         is_empty = False
         for _ in range(most):
@@ -78,7 +78,8 @@ class ByTheClock:
         self._numbers.append(info["publication_sequence_number"])
         self.take(data, info["received_timestamp"] or time.time_ns())
 
-    def _missing(self, numbers: list[int | None], n_publishers: int, is_empty: bool) -> Missing:
+    def _missing(self, numbers: list[int | None], n_publishers: int,
+                 is_empty: bool) -> LostMessages:
         """Return the gaps in the sequence numbers, if they are of one publisher.
 
         This is the case if there was one publisher now and at the previous check: messages of a
@@ -95,7 +96,7 @@ class ByTheClock:
             self._last, self._before = number, None
         if most > 1 or n_publishers == 0:
             self._last = None
-        return Missing(lost, unheard)
+        return LostMessages(lost, unheard)
 
     def pause(self) -> None:
         """Record the end of the subscription."""

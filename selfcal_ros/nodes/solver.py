@@ -14,7 +14,7 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import map_markers, rejected_marker
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.solving import Outcome, SolvingSession, solve, warm_up
+from selfcal_ros.sessions.solving import SolvingOutcome, SolvingSession, solve, warm_up
 
 READY_FOR = 21
 """Marks per side of the plate for which the worker prepares memory."""
@@ -33,7 +33,7 @@ class Solver(ManagedNode[SolverSettings]):
 
     session = WhileConfigured[SolvingSession]()
     _worker = WhileConfigured[ThreadPoolExecutor]()
-    _running = WhileConfigured[Future[Outcome] | None]()
+    _running = WhileConfigured[Future[SolvingOutcome] | None]()
 
     def __init__(self, **kwargs: Any) -> None:
         self._begun = 0  # jobs, including the running one
@@ -101,7 +101,7 @@ class Solver(ManagedNode[SolverSettings]):
             self._running = self._worker.submit(solve, job)
             self._running.add_done_callback(self._wake)
 
-    def _wake(self, _: Future[Outcome]) -> None:
+    def _wake(self, _: Future[SolvingOutcome]) -> None:
         """Wake the executor for a solution; called in the worker's thread."""
         executor = self.executor
         if executor is not None:
@@ -124,7 +124,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._advance()
         self.session.save_again()
 
-    def _take(self, running: Future[Outcome]) -> None:
+    def _take(self, running: Future[SolvingOutcome]) -> None:
         """Take a solution."""
         outcome, self._running = running.result(), None
         try:

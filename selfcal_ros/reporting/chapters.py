@@ -228,7 +228,7 @@ ANYWHERE = ("Anywhere: with the error of interpolating between the nodes, estima
 
 
 @dataclass(frozen=True)
-class Figure:
+class CaptionedFigure:
     """A drawing with its caption, which `on_screen` completes where there is a pointer."""
 
     drawing: Drawing
@@ -242,7 +242,7 @@ class Chapter:
     """A part of a report: figures, then tables; `alert` means that someone must act on it."""
 
     title: str
-    figures: tuple[Figure, ...] = ()
+    figures: tuple[CaptionedFigure, ...] = ()
     sections: tuple[Section, ...] = ()
     alert: bool = False
 
@@ -282,8 +282,9 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
     return [c for c in kept if c.figures or c.sections]
 
 
-def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[Figure, ...]:
-    return tuple(Figure(drawing, caption) for drawing, caption in pairs if drawing is not None)
+def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[CaptionedFigure, ...]:
+    return tuple(CaptionedFigure(drawing, caption)
+                 for drawing, caption in pairs if drawing is not None)
 
 
 def _causes(result: CalibrationResult) -> Chapter:
@@ -311,7 +312,7 @@ MAP = "Map"
 
 def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
     """Return the error and its uncertainty, first together, then by component."""
-    vectors = Figure(error_map(result, truth),
+    vectors = CaptionedFigure(error_map(result, truth),
                      "Each vector points from the true position of the stage to the indicated one.",
                      on_screen="Point at a site to read its numbers.")
     figures = [vectors, *_figures(

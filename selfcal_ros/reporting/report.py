@@ -14,7 +14,7 @@ from selfcal_ros.errors import InputError, first_line, printable
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import write_bytes, write_text
-from selfcal_ros.reporting.chapters import MAP, Chapter, Figure, chapters, heading
+from selfcal_ros.reporting.chapters import MAP, CaptionedFigure, Chapter, chapters, heading
 from selfcal_ros.reporting.figures.svg import css, inline_svg, printed_svg
 from selfcal_ros.reporting.summary.numbers import numeric_columns, truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
@@ -243,7 +243,7 @@ def _chapter(chapter: Chapter, *, printed: bool, more: str) -> str:
         part for part in parts if part) + "</section>"
 
 
-def _figure(figure: Figure, *, printed: bool) -> str:
+def _figure(figure: CaptionedFigure, *, printed: bool) -> str:
     drawing = printed_svg(figure.drawing) if printed else inline_svg(figure.drawing)
     caption = figure.caption if printed else f"{figure.caption} {figure.on_screen}".rstrip()
     return f"<figure>{drawing}<figcaption>{_text(caption)}</figcaption></figure>"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.clock_steps import Step, StepWatch
+from selfcal_ros.collection.clock_steps import ClockStep, StepWatch
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Command, begun_ns
 from selfcal_ros.collection.timeline import begins_run
 from selfcal_ros.sessions.health import Diagnosis, Level
@@ -46,7 +46,7 @@ class ClockWatch:
         self._live, self._live_run = False, ""
         self._bins: deque[tuple[float, int]] = deque()
         self._watches: dict[str, StepWatch] = {}
-        self.steps: dict[str, list[Step]] = {}
+        self.steps: dict[str, list[ClockStep]] = {}
 
     def command(self, stamp_ns: int, now_ns: int, *, is_older: bool, run_id: str = "") -> None:
         """Determine from a command whether the session is live; a latched one is ignored.
@@ -61,7 +61,7 @@ class ClockWatch:
         if self._live and run_id != self._live_run:
             self._live_run, self._watches, self.steps = run_id, {}, {}
 
-    def adopt(self, run_id: str, steps: Mapping[str, list[Step]]) -> None:
+    def adopt(self, run_id: str, steps: Mapping[str, list[ClockStep]]) -> None:
         """Continue a run in which clocks have stepped before."""
         self._live_run, self._watches = run_id, {}
         self.steps = {topic: list(mine) for topic, mine in steps.items()}
@@ -145,7 +145,7 @@ class RosTime:
 
 
 @dataclass(frozen=True)
-class Run:
+class PlanRun:
     """One run of a plan; `run_id` is the stamp of its first command, ns, as text.
 
     `run_id` is empty if a publisher or a recording does not provide it.
@@ -155,7 +155,7 @@ class Run:
     run_id: str = ""
 
 
-def supersedes(new: Run, current: Run) -> bool:
+def supersedes(new: PlanRun, current: PlanRun) -> bool:
     """Return whether messages of run `new` replace those of `current`.
 
     The later run wins. One whose beginning is unknown never replaces one whose beginning is known.
@@ -172,7 +172,7 @@ def is_future(stamp_ns: int, now_ns: int) -> bool:
     return now_ns > 0 and stamp_ns > now_ns + MAX_AHEAD_NS
 
 
-def begins_in_future(run: Run, now_ns: int) -> bool:
+def begins_in_future(run: PlanRun, now_ns: int) -> bool:
     """Return whether a run begins far ahead of a node's clock."""
     return is_future(begun_ns(run.run_id) or 0, now_ns)
 
@@ -219,5 +219,5 @@ class RunWatch:
         return found
 
 
-def _run_of(command: Command) -> Run:
-    return Run(command.plan_id, command.run_id)
+def _run_of(command: Command) -> PlanRun:
+    return PlanRun(command.plan_id, command.run_id)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
-from selfcal_ros.collection.clock_steps import Step, future_lines, step_lines
+from selfcal_ros.collection.clock_steps import ClockStep, future_lines, step_lines
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Phase, Reason, advice
@@ -112,7 +112,7 @@ class CollectingSession:
                          round(self._ports.now_s() * NS_PER_S) - ages)
 
     def adopt(self, collector: Collector, journal: str,
-              steps: Mapping[str, list[Step]] | None = None, away_s: float = 0.0) -> None:
+              steps: Mapping[str, list[ClockStep]] | None = None, away_s: float = 0.0) -> None:
         """Continue with a collector that has taken the run from a journal.
 
         Parameters

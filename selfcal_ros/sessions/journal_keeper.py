@@ -15,7 +15,7 @@ from typing import NamedTuple
 from selfcal_ros.bagio import journal as journals
 from selfcal_ros.bagio.offline import block_handlers
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.clock_steps import Step
+from selfcal_ros.collection.clock_steps import ClockStep
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
@@ -39,7 +39,7 @@ class ResumedRun:
 
     collector: Collector
     lost: tuple[str, ...]
-    steps: dict[str, list[Step]] = field(default_factory=dict)
+    steps: dict[str, list[ClockStep]] = field(default_factory=dict)
 
 
 def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
@@ -60,7 +60,7 @@ def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
     collector = Collector(settings)
     lost: list[str] = []
     refused: list[InputError] = []
-    steps: dict[str, list[Step]] = {}
+    steps: dict[str, list[ClockStep]] = {}
     feed = block_handlers(collector, lost)
     for file in files:
         try:

@@ -36,7 +36,7 @@ from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.reporting.words.verification import with_verification
-from selfcal_ros.sessions.clocks import Run, begins_in_future, supersedes
+from selfcal_ros.sessions.clocks import PlanRun, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
@@ -50,7 +50,7 @@ RETRY_S = 10.0
 class Job:
     """Readings to be solved, with their identification; passed to a worker."""
 
-    run: Run
+    run: PlanRun
     measurements: Measurements
     options: Options
     method: str
@@ -61,7 +61,7 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class SolvingOutcome:
     """Outcome of a job; `problem` if the readings do not identify the stage, or worse."""
 
     job: Job
@@ -69,18 +69,18 @@ class Outcome:
     problem: Exception | None
 
 
-def solve(job: Job) -> Outcome:
+def solve(job: Job) -> SolvingOutcome:
     """Solve a job; depends on nothing else, so it can run anywhere."""
     try:
         if job.measurements.verify:
-            return Outcome(job, _verified(job), None)
+            return SolvingOutcome(job, _verified(job), None)
         found = calibrate_by(job.method, job.measurements, job.options)
-        return Outcome(job, _finished(job, found), None)
+        return SolvingOutcome(job, _finished(job, found), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
-        return Outcome(job, _finished(job, result), told(error))
+        return SolvingOutcome(job, _finished(job, result), told(error))
     except Exception as error:  # reported by `take`, in the thread of the session
-        return Outcome(job, None, error)
+        return SolvingOutcome(job, None, error)
 
 
 def _verified(job: Job) -> results.CalibrationResult:
@@ -147,7 +147,7 @@ class Shown:
 
     result: results.CalibrationResult | None = None
     problem: Exception | None = None
-    run: Run = field(default_factory=Run)
+    run: PlanRun = field(default_factory=PlanRun)
     views_done: int = 0
     stamp_ns: int = 0
     digest: str = ""
@@ -171,9 +171,9 @@ class SolvingSession:
         self._settings, self._ports = settings, ports
         self._messages: dict[tuple[int, int, int], Any] = {}  # by view, and cell of the image
         self._notes: tuple[str, ...] = ()  # on the session, from the newest message
-        self._run = Run()
-        self._planned: dict[Run, int] = {}
-        self._ended: set[Run] = set()  # DONE was received
+        self._run = PlanRun()
+        self._planned: dict[PlanRun, int] = {}
+        self._ended: set[PlanRun] = set()  # DONE was received
         self._stale = False
         self._left_aside = 0
         self._saved = ""  # absolute path of the published map
@@ -200,7 +200,7 @@ class SolvingSession:
         """
         command = to_model.command(message)
         check_command(command)
-        run = Run(command.plan_id, command.run_id)
+        run = PlanRun(command.plan_id, command.run_id)
         known = self._planned.get(run, 0)
         self._planned[run] = max(known, command.views_planned)
         ends = command.phase == Phase.DONE and run not in self._ended
@@ -208,13 +208,13 @@ class SolvingSession:
             self._ended.add(run)
         tells = not self._planned_views(run) or isinstance(
             self.shown.problem, NoDataError | NotIdentifiableError)
-        if run in (self._run, Run(self._run.plan_id)) and (
+        if run in (self._run, PlanRun(self._run.plan_id)) and (
                 command.views_planned > known or (ends and tells)):
             self._stale = True  # the summary shows the number of planned or remaining views
 
-    def _planned_views(self, run: Run) -> int:
+    def _planned_views(self, run: PlanRun) -> int:
         """Return the number of planned views; commands without a run count for all runs."""
-        return max(self._planned.get(run, 0), self._planned.get(Run(run.plan_id), 0))
+        return max(self._planned.get(run, 0), self._planned.get(PlanRun(run.plan_id), 0))
 
     def take_measurement(self, message: Any) -> None:
         """Take the readings of a view; those of an older run are ignored.
@@ -226,7 +226,7 @@ class SolvingSession:
         """
         check_view(to_model.view_readings(message), to_model.artifact_of(message),
                    int(message.view_index))
-        run, now_ns = Run(message.plan_id, message.run_id), self._ports.now_ns()
+        run, now_ns = PlanRun(message.plan_id, message.run_id), self._ports.now_ns()
         if begins_in_future(run, now_ns):
             raise InputError(MEASUREMENT_TOPIC, f"run {run.run_id} begins in the future of this "
                              "node's clock", "set the clocks, and start the plan again")
@@ -317,7 +317,7 @@ class SolvingSession:
     def _verifies_later(self) -> bool:
         """Return whether views of a verification are to come: one says less than all."""
         newest = next(iter(self._messages.values()), None)
-        over = bool(self._ended & {self._run, Run(self._run.plan_id)})
+        over = bool(self._ended & {self._run, PlanRun(self._run.plan_id)})
         if newest is None or not to_model.plan_keys_of(newest)["verify"] or over or (
                 self._views_done >= self._planned_views(self._run)):
             return False
@@ -326,7 +326,7 @@ class SolvingSession:
         self._publish_summary()
         return True
 
-    def take(self, outcome: Outcome) -> None:
+    def take(self, outcome: SolvingOutcome) -> None:
         """Publish the outcome of a job, unless another run has begun meanwhile."""
         job = outcome.job
         if job.run != self._run:
@@ -341,7 +341,7 @@ class SolvingSession:
         if self._settings.save_path and outcome.problem is None:
             self._save_by_itself(outcome.result)
 
-    def _take_none(self, outcome: Outcome) -> None:
+    def _take_none(self, outcome: SolvingOutcome) -> None:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
         self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns,
@@ -412,7 +412,7 @@ class SolvingSession:
         """
         run, problem = self.shown.run, self.shown.problem
         to_come = self.shown.views_done < self._planned_views(run)
-        over = bool(self._ended & {run, Run(run.plan_id)})
+        over = bool(self._ended & {run, PlanRun(run.plan_id)})
         if isinstance(problem, NoDataError):
             return not over or to_come
         return isinstance(problem, NotIdentifiableError) and to_come and not over
@@ -459,7 +459,7 @@ class SolvingSession:
         newer = self._newer(self._planned)
         return line + (f"; WARNING: {newer}" if newer else ""), str(target)
 
-    def _newer(self, runs: Iterable[Run]) -> str:
+    def _newer(self, runs: Iterable[PlanRun]) -> str:
         """Return a note on a run that is newer than the published one; "" if none."""
         now_ns, shown = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
         later = [(begun, run) for run in runs if (begun := begun_ns(run.run_id))
@@ -473,7 +473,7 @@ class SolvingSession:
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and log it."""
         result = read_result(path)
-        self.shown = Shown(result, run=Run(result.plan_id, result.run_id),
+        self.shown = Shown(result, run=PlanRun(result.plan_id, result.run_id),
                            views_done=len({without_cell(view.name) for view in result.views}))
         self._saved = self._unsaved = ""
         self._publish(result)

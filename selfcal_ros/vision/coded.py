@@ -9,7 +9,7 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.edge_markers import CORNERS, DICTIONARY, SIDE, edge_markers
-from selfcal_ros.vision.detector import Fault, Mark
+from selfcal_ros.vision.detector import Mark, MarkFault
 from selfcal_ros.vision.images import Picture
 
 AGREE = 0.15
@@ -54,7 +54,7 @@ class CodedPlate:
             getattr(cv2.aruco, DICTIONARY)), parameters)
 
     def identified(self, marks: Sequence[Mark], picture: Picture, *,
-                   mirror: bool) -> list[tuple[int, int] | Fault | None]:
+                   mirror: bool) -> list[tuple[int, int] | MarkFault | None]:
         """Return the id (m, n) of each mark; None if it is not known, a fault if it is none.
 
         Parameters
@@ -98,10 +98,10 @@ class CodedPlate:
             return None
         return lambda at: factor * at + shift, seen
 
-    def _id(self, place: complex, seen: np.ndarray) -> tuple[int, int] | Fault | None:
+    def _id(self, place: complex, seen: np.ndarray) -> tuple[int, int] | MarkFault | None:
         at = np.array([place.real, place.imag])
         if (np.abs(seen - at).max(axis=1) < SIDE / 2 + 0.05).any():
-            return Fault.MARKER
+            return MarkFault.MARKER
         index = at + (self._shape - 1) / 2
         nearest = np.round(index)
         if np.abs(index - nearest).max() > NEAR or (nearest < 0).any() or (

@@ -32,7 +32,7 @@ FIRST_BLUR = 0.05
 """First blur of a fit, in sizes of the mark; at least a pixel."""
 
 
-class Fault(StrEnum):
+class MarkFault(StrEnum):
     """Why a possible mark is rejected."""
 
     CUT_OFF = "cut_off"
@@ -78,7 +78,7 @@ class Judged:
 
     u: float
     v: float
-    found: Mark | Fault
+    found: Mark | MarkFault
 
 
 class MarkDetector:
@@ -141,7 +141,8 @@ class MarkDetector:
         """
         return told_apart(self.judged(picture))
 
-    def _fitted(self, image: np.ndarray, seen: list[Candidate], full: int) -> list[Mark | Fault]:
+    def _fitted(self, image: np.ndarray, seen: list[Candidate],
+                full: int) -> list[Mark | MarkFault]:
         """Return the mark at each candidate, or why there is none.
 
         Each is fitted again in a window centred on a first fit, so that nothing depends on the
@@ -149,7 +150,7 @@ class MarkDetector:
         """
         if not seen:
             return []
-        out: list[Mark | Fault] = [Fault.NO_FIT] * len(seen)
+        out: list[Mark | MarkFault] = [MarkFault.NO_FIT] * len(seen)
         columns, rows = (np.array([getattr(candidate, name) for candidate in seen], dtype=int)
                          for name in ("column", "row"))
         blur = max(1.0, FIRST_BLUR * self.size)
@@ -159,7 +160,7 @@ class MarkDetector:
         while len(waiting):
             again = []
             for index, fit in self._fits(image, (columns, rows), starts, waiting, full):
-                if isinstance(fit, Fault):
+                if isinstance(fit, MarkFault):
                     out[index] = fit
                     continue
                 du, dv = (round(float(away)) for away in fit.centre)
@@ -174,24 +175,24 @@ class MarkDetector:
         return out
 
     def _fits(self, image: np.ndarray, at: tuple[np.ndarray, np.ndarray], starts: np.ndarray,
-              which: np.ndarray, full: int) -> Iterator[tuple[int, Fit | Fault]]:
+              which: np.ndarray, full: int) -> Iterator[tuple[int, Fit | MarkFault]]:
         """Yield the fit of each candidate in `which`, or why there is none."""
         columns, rows = at[0][which], at[1][which]
         radius = self._model.reach * self.size + 2
         inside = lie_inside(image, columns, rows, radius)
         for index in which[~inside]:
-            yield int(index), Fault.CUT_OFF
+            yield int(index), MarkFault.CUT_OFF
         windows = windows_of(image, columns[inside], rows[inside], radius)
         saturated = (windows.values >= full).mean(axis=1) > SATURATED
         for index in which[inside][saturated]:
-            yield int(index), Fault.SATURATED
+            yield int(index), MarkFault.SATURATED
         left = which[inside][~saturated]
         fits = fit_marks(self._model, Windows(windows.disc, windows.values[~saturated]),
                          starts[left])
         for index, fit in zip(left, fits, strict=True):
-            yield int(index), Fault.NO_FIT if fit is None else fit
+            yield int(index), MarkFault.NO_FIT if fit is None else fit
 
-    def _mark(self, fit: Fit, column: int, row: int) -> Mark | Fault:
+    def _mark(self, fit: Fit, column: int, row: int) -> Mark | MarkFault:
         """Return the mark of a fit in the window at a pixel, or why it is rejected."""
         fault = self._fault(fit)
         if fault is not None:
@@ -200,22 +201,22 @@ class MarkDetector:
         return Mark(column + float(fit.centre[0]), row + float(fit.centre[1]), u_u, u_v,
                     min(max(fit.explained, 0.0), 1.0), fit)
 
-    def _fault(self, fit: Fit) -> Fault | None:
+    def _fault(self, fit: Fit) -> MarkFault | None:
         """Return why a fitted mark is rejected, or None."""
         given = self.settings
         size = fit.shape.get("size", self.size)
         if self._sign * fit.contrast < 0:
-            return Fault.NO_FIT
+            return MarkFault.NO_FIT
         if abs(fit.shape["blur"]) > given.max_blur * self.size:
-            return Fault.DEFOCUSED
+            return MarkFault.DEFOCUSED
         if fit.bright + fit.dark + fit.inner_stains + fit.outer_stains >= STAINED:
             if max(fit.bright, fit.dark) >= STAINED:  # these spoil the levels of the others
-                return Fault.REFLECTION if fit.bright > fit.dark else Fault.DIRT
-            return Fault.BROKEN if fit.inner_stains > fit.outer_stains else Fault.DIRT
+                return MarkFault.REFLECTION if fit.bright > fit.dark else MarkFault.DIRT
+            return MarkFault.BROKEN if fit.inner_stains > fit.outer_stains else MarkFault.DIRT
         if abs(size / self.size - 1) > given.size_tolerance:
-            return Fault.WRONG_SIZE
+            return MarkFault.WRONG_SIZE
         if not max(fit.sigmas) <= given.max_sigma_px:
-            return Fault.WEAK
+            return MarkFault.WEAK
         return None
 
     def nothing_found(self, picture: Picture | None, rejected: Counter[str]) -> tuple[str, str]:
@@ -279,7 +280,7 @@ def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
     return marks, faults
 
 
-def _without_doubles(marks: list[Mark | Fault], near: float) -> list[Mark | Fault]:
+def _without_doubles(marks: list[Mark | MarkFault], near: float) -> list[Mark | MarkFault]:
     """Return the marks; one that lies nearer than `near` to an earlier one is a double, px."""
     places = np.array([(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan)
                        for mark in marks]).reshape(len(marks), 2)
@@ -290,7 +291,7 @@ def _without_doubles(marks: list[Mark | Fault], near: float) -> list[Mark | Faul
     pairs = known[KDTree(places[known]).query_pairs(near, output_type="ndarray")]
     for first, second in sorted(map(tuple, np.sort(pairs, axis=1)), key=lambda pair: pair[::-1]):
         if isinstance(out[first], Mark):
-            out[second] = Fault.DOUBLE
+            out[second] = MarkFault.DOUBLE
     return out
 
 

@@ -12,7 +12,7 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError, printable
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.coded import CodedPlate
-from selfcal_ros.vision.detector import Fault, Judged, Mark, MarkDetector, told_apart
+from selfcal_ros.vision.detector import Judged, Mark, MarkDetector, MarkFault, told_apart
 from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 
 SETTLED = 3
@@ -169,8 +169,8 @@ class ImageDetector:
         out = []
         for each in judged:
             said = next(each_id) if isinstance(each.found, Mark) else None
-            out.append(replace(each, found=said) if isinstance(said, Fault) else each)
-        return out, [known for known in found if not isinstance(known, Fault)]
+            out.append(replace(each, found=said) if isinstance(said, MarkFault) else each)
+        return out, [known for known in found if not isinstance(known, MarkFault)]
 
     def _refuse_other(self, image: tuple, name: str) -> None:
         """Refuse an image of another camera or size than the settled one, before it is decoded.

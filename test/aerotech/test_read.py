@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.aerotech.model import Kind, Severity, Unit, UnitWord
+from selfcal_ros.aerotech.model import Severity, TableKind, Unit, UnitWord
 from selfcal_ros.aerotech.read import load_cal, parse_cal, read_cal
 from selfcal_ros.errors import InputError
 
@@ -46,7 +46,7 @@ def test_strict_1d_file():
     (table,) = cal.tables
     assert cal.findings == () and cal.comments == ("accuracy of the first axis",)
     assert (table.axis, table.reference, table.sample_dist, table.offset) == (1, 1, 10.0, 10.0)
-    assert table.serial_number == "12;3'4" and table.kind is Kind.ONE_D
+    assert table.serial_number == "12;3'4" and table.kind is TableKind.ONE_D
     assert table.position_unit == Unit(UnitWord.PRIMARY)
     assert table.correction_unit == Unit(UnitWord.PRIMARY, 1000.0)
     np.testing.assert_array_equal(table.values, [0, 1.5, -0.2])
@@ -86,7 +86,7 @@ def test_every_2d_keyword_and_a_galvo_table():
     assert (table.absolute_feedback_offset_row, table.absolute_feedback_offset_col) == (1.0, 2.0)
     assert (table.rollover_row, table.rollover_col, table.serial_number) == (3.0, 4.0, "S")
     (table,) = only_tolerated(":GALVO2D 2 1 1 2 10 10 1 NEGCOR OUTAXIS3=3\n0 0 0\n:END\n")
-    assert table.kind is Kind.GALVO and table.galvo and table.outputs == (1, 2, 3)
+    assert table.kind is TableKind.GALVO and table.galvo and table.outputs == (1, 2, 3)
 
 
 def test_several_tables_and_several_start_lines():
@@ -138,7 +138,7 @@ WILD = [
 @pytest.mark.parametrize(("text", "want"), [(text, want) for text, *want in WILD])
 def test_files_met_in_the_wild_are_read_and_reported(text, want):
     (table,) = only_tolerated(text, *want)
-    if table.kind is Kind.TWO_D:
+    if table.kind is TableKind.TWO_D:
         np.testing.assert_array_equal(table.values.ravel(), np.arange(1, 13))
 
 

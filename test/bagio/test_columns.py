@@ -11,7 +11,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio import mcap_chunk, mcap_salvage
-from selfcal_ros.bagio.mcap_chunk import Block, chunk_items
+from selfcal_ros.bagio.mcap_chunk import MessageBlock, chunk_items
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import ENOUGH
 from selfcal_ros.collection.inputs import Detection, EncoderSample
@@ -241,7 +241,7 @@ def flat(items):
     """Return the records in the items of a chunk."""
     out = []
     for item in items:
-        out += item.messages() if isinstance(item, Block) else [item]
+        out += item.messages() if isinstance(item, MessageBlock) else [item]
     return out
 
 
@@ -287,7 +287,7 @@ def test_a_chunk_gives_what_the_library_gives(seed):
 def test_records_between_messages_keep_their_place():
     data = message(1, b"a") + CHANNEL + message(4, b"b") + message(4, b"c") + SCHEMA
     kinds = [type(item) for item in chunk_items(FakeChunk(data))]
-    assert kinds == [Block, Channel, Block, Schema]
+    assert kinds == [MessageBlock, Channel, MessageBlock, Schema]
     assert [m.data for m in flat(chunk_items(FakeChunk(data))) if isinstance(m, Message)] == [
         b"a", b"b", b"c"]
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.clock_steps import Step, StepWatch, step_lines
+from selfcal_ros.collection.clock_steps import ClockStep, StepWatch, step_lines
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact
@@ -145,13 +145,15 @@ def timeline():
     (500, 37 * S, "stepped ahead by 37 s between views, at 1700000002.500 s: what was stamped "
      "since may be missing or counted in a later view;")])
 def test_the_line_says_whose_clock_how_much_and_where(at, by_ns, words):
-    step = Step(int(TRUE[at]), by_ns)
-    (line,) = step_lines({"b": [step], "a": [Step(step.before_ns + MS, by_ns + MS)]}, timeline())
+    step = ClockStep(int(TRUE[at]), by_ns)
+    later = ClockStep(step.before_ns + MS, by_ns + MS)
+    (line,) = step_lines({"b": [step], "a": [later]}, timeline())
     assert line.startswith(f"the clock that stamps a and b {words}")
 
 
 def test_steps_of_two_clocks_are_two_lines():
-    lines = step_lines({"a": [Step(int(TRUE[9]), S)], "b": [Step(int(TRUE[9]), -S)]}, timeline())
+    ahead, back = (ClockStep(int(TRUE[9]), by_ns) for by_ns in (S, -S))
+    lines = step_lines({"a": [ahead], "b": [back]}, timeline())
     assert [line.split(" by ")[0] for line in lines] == [
         "the clock that stamps a stepped ahead", "the clock that stamps b stepped back"]
     assert step_lines({"a": []}, timeline()) == []

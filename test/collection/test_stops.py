@@ -20,7 +20,7 @@ from selfcal_ros.collection.marks.stops import (
     without_aside,
 )
 from selfcal_ros.model.artifact import Artifact, MapGrid
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import GridVisits, Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
@@ -195,7 +195,7 @@ def test_a_stop_on_one_side_alone_is_a_repeat():
         assert stops.tolist() == (count - [extra, 0]).tolist() and done == 0
 
 
-WIDE = View("90", np.pi / 2, (0.01, 0.0), image=Image(3, 5, 0.01))
+WIDE = View("90", np.pi / 2, (0.01, 0.0), image=ImageCells(3, 5, 0.01))
 
 
 def test_cells_are_numbered_in_their_order_and_what_lies_beyond_them_is_none():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.combine import Run, mean_of
+from selfcal_ros.estimation.comparison.combine import RunValues, mean_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
@@ -35,8 +35,8 @@ def test_the_budget_of_a_map_has_u_dof_and_k_of_gtc(u_scale):
 @pytest.mark.parametrize(("u", "dof"), [((2.0, 1.0), (5.0, 8.0)), ((1.0, 1.0), (3.0, np.inf)),
                                         ((0.3, 4.0), (60.0, 2.5))])
 def test_the_deviation_of_a_run_has_the_dof_of_gtc(u, dof):
-    runs = [Run(np.array([9.0 * (i == 0), 0, 0, 0]), one**2 * np.eye(4), np.zeros((4, 4)), True,
-                many) for i, (one, many) in enumerate(zip(u, dof, strict=True))]
+    runs = [RunValues(np.array([9.0 * (i == 0), 0, 0, 0]), one**2 * np.eye(4), np.zeros((4, 4)),
+                      True, many) for i, (one, many) in enumerate(zip(u, dof, strict=True))]
     e_n = mean_of(runs, np.zeros((4, 0)), np.zeros((4, 0))).deviations[0].e_n[0]
     difference = gtc.ureal(9.0, u[0], dof[0]) - gtc.ureal(0.0, u[1], dof[1])
     assert e_n == pytest.approx(9.0 / (coverage_factor(gtc.dof(difference))

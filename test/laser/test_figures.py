@@ -12,7 +12,7 @@ from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.profiles import profile_m, u_profile_m
 from selfcal_ros.laser.report import profiles_figure
-from selfcal_ros.laser.table import Columns, read_table
+from selfcal_ros.laser.table import RequiredColumns, read_table
 from selfcal_ros.reporting.figures.drawing import Discs, Label
 from selfcal_ros.reporting.figures.drawing import Path as Line
 
@@ -20,7 +20,7 @@ EXAMPLE = Path(__file__).parents[2] / "config" / "step_diagonal" / "case_study.c
 
 
 def test_bars_are_as_long_as_u_with_the_k_of_the_repeats():
-    data, _ = read_table(EXAMPLE, Columns((0.01, 0.01), DIAGONALS[2], True))
+    data, _ = read_table(EXAMPLE, RequiredColumns((0.01, 0.01), DIAGONALS[2], True))
     found = identify(data, Choice(Method.NEW, Form.EXACT))
     drawing = profiles_figure(found, data)
     dots = [item.centres for item in drawing.items if isinstance(item, Discs)]

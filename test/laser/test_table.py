@@ -11,7 +11,7 @@ from selfcal_ros.laser.simulation import (
     simulate_step_diagonal,
 )
 from selfcal_ros.laser.table import (
-    Columns,
+    RequiredColumns,
     dimension_of,
     read_table,
     table_text,
@@ -20,8 +20,8 @@ from selfcal_ros.laser.table import (
 
 HEAD = "block,rx_pp,ry_pp,rx_np,ry_np,ex_x,ey_y"
 GOOD = "7.0711,7.0712,7.0713,7.0714,0.0001,0.0002"
-CONVENTIONAL = Columns((0.01, 0.01), DIAGONALS[2], False)
-NEW = Columns((0.01, 0.01), DIAGONALS[2], True)
+CONVENTIONAL = RequiredColumns((0.01, 0.01), DIAGONALS[2], False)
+NEW = RequiredColumns((0.01, 0.01), DIAGONALS[2], True)
 
 
 def read(tmp_path, text, columns=NEW):
@@ -68,7 +68,7 @@ def test_writing_and_reading_gives_the_same_measurement(tmp_path, steps):
     path = tmp_path / "out.csv"
     write_table(path, data, ["two repeats"])
     assert dimension_of(path) == len(steps)
-    back, warnings = read_table(path, Columns(steps, DIAGONALS[len(steps)], True))
+    back, warnings = read_table(path, RequiredColumns(steps, DIAGONALS[len(steps)], True))
     np.testing.assert_allclose(back.samples_m, data.samples_m, atol=0.6e-11)
     np.testing.assert_allclose(back.linear_m, data.linear_m, atol=0.6e-11)
     assert not warnings
@@ -91,7 +91,7 @@ def test_diagonals_and_axes_of_unequal_repeats_lose_nothing(tmp_path, repeats):
         linear[repeats[2 + index]:, index] = np.nan
     path = tmp_path / "out.csv"
     write_table(path, StepDiagonal((0.01, 0.01), DIAGONALS[2], samples, linear))
-    back, _ = read_table(path, Columns((0.01, 0.01), DIAGONALS[2], True))
+    back, _ = read_table(path, RequiredColumns((0.01, 0.01), DIAGONALS[2], True))
     rows = max(repeats)
     for got, want in ((back.samples_m, samples), (back.linear_m, linear)):
         assert got.shape[0] == rows

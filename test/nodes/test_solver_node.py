@@ -29,7 +29,7 @@ from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.sessions.compensating import read_result
-from selfcal_ros.sessions.solving import Outcome
+from selfcal_ros.sessions.solving import SolvingOutcome
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan
 
@@ -197,7 +197,7 @@ def test_save_map_before_a_solution_that_failed_is_taken_says_why(graph, monkeyp
     monkeypatch.setattr(solver_module, "SWEEP_S", 3600.0)
     monkeypatch.setattr(Solver, "_wake", lambda node, solution: None)
     problem = NotSettledError("the readings", "did not converge", "measure anew")
-    monkeypatch.setattr(solver_module, "solve", lambda job: Outcome(job, None, problem))
+    monkeypatch.setattr(solver_module, "solve", lambda job: SolvingOutcome(job, None, problem))
     node = graph.node(Solver, result_folder=str(tmp_path))
     messages, _ = measured(PLAN)
     graph.publisher(names.MEASUREMENT).publish(messages[0])

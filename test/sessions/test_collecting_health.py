@@ -10,7 +10,7 @@ import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.clock_steps import Step
+from selfcal_ros.collection.clock_steps import ClockStep
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.messages.from_model import event_fields
@@ -133,7 +133,7 @@ def test_a_step_that_is_found_behind_the_readings_is_sent_with_them_once():
     desk.feed(events)
     desk.session.tick()
     desk.hands.published.clear()
-    desk.session._clock.steps["stage/joint_states"] = [Step(sample.stamp_ns, 10**9)]
+    desk.session._clock.steps["stage/joint_states"] = [ClockStep(sample.stamp_ns, 10**9)]
     for _ in range(2):
         desk.session.take_encoder(encoder_block(sample))
         desk.hands.pass_time(1)

@@ -24,7 +24,7 @@ from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.sessions.clocks import Run, supersedes
+from selfcal_ros.sessions.clocks import PlanRun, supersedes
 from selfcal_ros.sessions.compensating import plan_file_name, read_result, result_file
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.solving import RETRY_S, SolvingSession, solve
@@ -176,12 +176,14 @@ def test_readings_of_two_runs_are_never_mixed(desk):
 
 
 @pytest.mark.parametrize("new, current, later", [
-    (Run("a", "2"), Run("a", "1"), True), (Run("a", "1"), Run("a", "2"), False),
-    (Run("a", "10"), Run("a", "9"), True), (Run("b", "1"), Run("a", "2"), False),
-    (Run("b"), Run("a", "2"), False), (Run("a", "2"), Run("a"), True),
-    (Run("b"), Run("a"), True),
-    (Run("a", "x"), Run("a", "2"), False), (Run("a", "9" * 21), Run("a", "2"), False),
-    (Run("a", "2"), Run("a", "9" * 21), True), (Run("a", "2"), Run("a", "9" * 20), False)])
+    (PlanRun("a", "2"), PlanRun("a", "1"), True), (PlanRun("a", "1"), PlanRun("a", "2"), False),
+    (PlanRun("a", "10"), PlanRun("a", "9"), True), (PlanRun("b", "1"), PlanRun("a", "2"), False),
+    (PlanRun("b"), PlanRun("a", "2"), False), (PlanRun("a", "2"), PlanRun("a"), True),
+    (PlanRun("b"), PlanRun("a"), True),
+    (PlanRun("a", "x"), PlanRun("a", "2"), False),
+    (PlanRun("a", "9" * 21), PlanRun("a", "2"), False),
+    (PlanRun("a", "2"), PlanRun("a", "9" * 21), True),
+    (PlanRun("a", "2"), PlanRun("a", "9" * 20), False)])
 def test_the_later_run_supersedes(new, current, later):
     assert supersedes(new, current) is later
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.collection.inputs import Detection, Kind
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.simulation import physics
@@ -140,7 +140,7 @@ def test_marks_that_no_cell_is_declared_for_turn_like_the_others(sense):
     settings = CellSettings(sense, servo_sigma_m=0.0, stop_sigma_m=0.0, with_ids=True)
     camera = Camera(width=300, height=300, pixel_size_m=1e-3, mark_size_m=2e-2)
     found = []
-    for image in (None, Image(3, 3, PLATE.grid_pitch_m)):
+    for image in (None, ImageCells(3, 3, PLATE.grid_pitch_m)):
         plan = Plan("yaw", PLATE, (View("v", angular=False, image=image),))
         events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(1),
                              start_ns=0)

@@ -22,7 +22,7 @@ from selfcal_ros.estimation.checks.wiring import BEYOND, SHOWN
 from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariance
 from selfcal_ros.estimation.comparison.maps import (
     KINDS,
-    Spread,
+    ReducedNoise,
     joint_dof,
     require_same_lattice,
     significance,
@@ -183,7 +183,7 @@ TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RunValues:
     """The values of one run.
 
     Attributes
@@ -364,7 +364,7 @@ def _families(values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray,
     return found
 
 
-def mean_of(runs: list[Run], removed: np.ndarray, shapes: np.ndarray) -> Mean:
+def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> Mean:
     """Return the weighted mean of runs.
 
     Parameters
@@ -419,7 +419,7 @@ def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
                    for f, c in zip(factors, covariances, strict=True)], axis=0)
 
 
-def _p_between(families: list[_Family], runs: list[Run], own: list[np.ndarray]) -> float:
+def _p_between(families: list[_Family], runs: list[RunValues], own: list[np.ndarray]) -> float:
     """Return the probability of the scatter between runs by chance: the worst, Bonferroni."""
     dof, together = _noise_dof(runs, own, np.ones(len(runs))), _sum(own, np.ones(len(own)))
     found = []
@@ -430,14 +430,14 @@ def _p_between(families: list[_Family], runs: list[Run], own: list[np.ndarray]) 
     return min(1.0, len(found) * min(found, default=1.0))
 
 
-def _noise_dof(runs: list[Run], own: list[np.ndarray], factors: np.ndarray) -> float:
+def _noise_dof(runs: list[RunValues], own: list[np.ndarray], factors: np.ndarray) -> float:
     """Return the degrees of freedom of a sum of the runs' covariances (Welch-Satterthwaite)."""
     power = [float(f * variances(c).mean()) for f, c in zip(factors, own, strict=True)]
     return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
 
 
-def _dof(runs: list[Run], own: list[np.ndarray], families: list[_Family], weights: np.ndarray, *,
-         whole: np.ndarray) -> float:
+def _dof(runs: list[RunValues], own: list[np.ndarray], families: list[_Family],
+         weights: np.ndarray, *, whole: np.ndarray) -> float:
     """Return the degrees of freedom of the mean's u, the median of all values.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
@@ -472,7 +472,7 @@ def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> 
     return min((len(weights) - 1) * (1 + ratio) ** 2, MANY_DOF)
 
 
-def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray],
+def _deviation(i: int, runs: list[RunValues], values: np.ndarray, own: list[np.ndarray],
                common: np.ndarray, weights: np.ndarray, q: np.ndarray,
                between: np.ndarray) -> Deviation:
     """Return the deviation of run i from the weighted mean of the others."""
@@ -484,7 +484,7 @@ def _deviation(i: int, runs: list[Run], values: np.ndarray, own: list[np.ndarray
     total = _sum([*own, common], np.append(factors, (shares[i] - others @ shares) ** 2))
     dof = _noise_dof(runs, own, factors)
     full = all(run.covariance.ndim == 2 for run in runs)
-    test = significance(rest, Spread(total if full else variances(total), q, dof))
+    test = significance(rest, ReducedNoise(total if full else variances(total), q, dof))
     u = np.sqrt(variances(total))
     e_n = np.divide(rest, coverage_factor(dof) * u, out=np.zeros_like(rest), where=u > 0)
     return Deviation(e_n, test, _p_scatter(i, values, own, others, between))
@@ -637,16 +637,16 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
         equal_nan=True))
 
 
-def _run(part: Part, kind: str, known: np.ndarray, *, keep_scale: bool) -> Run:
+def _run(part: Part, kind: str, known: np.ndarray, *, keep_scale: bool) -> RunValues:
     values, u = (of[:, known].ravel() for of in part.error_map.of(kind))
     result, factors = part.result, np.zeros((0, len(values)))
     if result is None:
-        return Run(values, u**2, np.zeros(len(u)), False, np.inf)
+        return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known)
     if kind == "xy":
         factors = _common(result, known, keep_scale=keep_scale)
     common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
-    return Run(values, covariance - common, common, True, result.noise.dof_of(kind))
+    return RunValues(values, covariance - common, common, True, result.noise.dof_of(kind))
 
 
 def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -> np.ndarray:

@@ -31,7 +31,7 @@ DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class ReducedNoise:
     """Noise of n values from which columns were taken off by least squares.
 
     Attributes
@@ -137,7 +137,7 @@ def of_one_kind(covers: Sequence[np.ndarray]) -> list[np.ndarray]:
     return list(covers) if full else [variances(cover) for cover in covers]
 
 
-def significance(values: np.ndarray, spread: Spread) -> Significance | None:
+def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | None:
     """Test values (n,) without columns against their noise; None if that is unknown or none."""
     covariance, dof = spread.covariance, spread.dof
     if not np.isfinite(covariance).all() or not covariance.any():
@@ -316,7 +316,7 @@ def _difference(results: Sequence[CalibrationResult], maps: Sequence[ErrorMap], 
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
     dof = joint_dof(*zip(power, [getattr(result.noise, f"dof_{kind}") for result in results],
                          strict=True))
-    return _Difference(out, datum, significance(values, Spread(total, columns, dof)))
+    return _Difference(out, datum, significance(values, ReducedNoise(total, columns, dof)))
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:

@@ -20,7 +20,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.comparison.maps import (
-    Spread,
+    ReducedNoise,
     joint_dof,
     of_one_kind,
     require_same_lattice,
@@ -46,7 +46,7 @@ SHARED = 0.5
 """Part of an older table of the same stage that is in the map, of its size or of its square."""
 
 
-class Fault(StrEnum):
+class TableFault(StrEnum):
     """What is wrong with the correction that acts."""
 
     NONE = "none"
@@ -108,8 +108,8 @@ class Verification:
     """
 
     better: bool
-    fault: Fault
-    theta_fault: Fault
+    fault: TableFault
+    theta_fault: TableFault
     remains: bool
     axes: Mapping[str, AxisError]
     alike: float
@@ -124,8 +124,8 @@ class Verification:
 
         A correction of x and y alone passes.
         """
-        wrong_angle = self.theta_fault in (Fault.SIGN, Fault.FACTOR)
-        return self.better and self.fault in (Fault.NONE, Fault.OLDER) and not wrong_angle
+        wrong_angle = self.theta_fault in (TableFault.SIGN, TableFault.FACTOR)
+        return self.better and self.fault in (TableFault.NONE, TableFault.OLDER) and not wrong_angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ class _Maps:
     @cached_property
     def remaining(self) -> Significance | None:
         """Test of the error with the correction on, with the covariance of both maps."""
-        return significance(self.after, Spread(self.cover, self.datum, self.dof))
+        return significance(self.after, ReducedNoise(self.cover, self.datum, self.dof))
 
     @property
     def remains(self) -> bool:
@@ -266,7 +266,7 @@ def is_believed(after: CalibrationResult, found: "Verification") -> bool:
 
     Against a known plate, a stage that is corrected wrongly looks like another plate.
     """
-    named = found.fault not in (Fault.NONE, Fault.OTHER, Fault.OLDER)
+    named = found.fault not in (TableFault.NONE, TableFault.OTHER, TableFault.OLDER)
     other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
     return after.verdict.qualified or (named and other_plate)
 
@@ -308,12 +308,12 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
                          "solve it again with --uncertainty always")
     fault = _fault(maps, first)
     if maps.better and not maps.remains:
-        fault = Fault.NONE
-    elif fault is Fault.OTHER and (maps.better or maps.alike * abs(maps.alike) > SHARED):
-        fault = Fault.OLDER
+        fault = TableFault.NONE
+    elif fault is TableFault.OTHER and (maps.better or maps.alike * abs(maps.alike) > SHARED):
+        fault = TableFault.OLDER
     axes = _axes(maps, (before, after))
 
-    better, theta_fault = maps.better, Fault.NONE
+    better, theta_fault = maps.better, TableFault.NONE
     lines = np.isfinite(first.g_theta + second.g_theta)
     g_theta = np.full(lines.shape, np.nan)
     if lines.sum() > 2:
@@ -368,10 +368,10 @@ def _columns(field: np.ndarray) -> np.ndarray:
     return block_diag(*field[:, :, None])
 
 
-def _fault(maps: _Maps, emap: ErrorMap) -> Fault:
+def _fault(maps: _Maps, emap: ErrorMap) -> TableFault:
     """Return what acts on x and y instead of the map."""
     if maps.too_small:
-        return Fault.TOO_SMALL
+        return TableFault.TOO_SMALL
     if maps.explained:
         return _of_factors(maps.factors)
     others = {}
@@ -382,49 +382,49 @@ def _fault(maps: _Maps, emap: ErrorMap) -> Fault:
             weights = np.linalg.lstsq(moved, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
                 others[fault] = maps.unexplained(moved @ weights)
-    likely = min(others, key=lambda name: others[name], default=Fault.OTHER)
-    return likely if others.get(likely, np.inf) < NEAR else Fault.OTHER
+    likely = min(others, key=lambda name: others[name], default=TableFault.OTHER)
+    return likely if others.get(likely, np.inf) < NEAR else TableFault.OTHER
 
 
-def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[Fault, tuple[np.ndarray, np.ndarray]]:
+def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[TableFault, tuple[np.ndarray, np.ndarray]]:
     """Return a map (nx, ny) as it acts with each fault of arrangement."""
-    found = {Fault.COMPONENTS: (gy, gx), Fault.MIRRORED_X: (gx[::-1], gy[::-1]),
-             Fault.MIRRORED_Y: (gx[:, ::-1], gy[:, ::-1]),
-             Fault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1])}
+    found = {TableFault.COMPONENTS: (gy, gx), TableFault.MIRRORED_X: (gx[::-1], gy[::-1]),
+             TableFault.MIRRORED_Y: (gx[:, ::-1], gy[:, ::-1]),
+             TableFault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1])}
     if gx.shape[0] == gx.shape[1]:
-        found |= {Fault.PLACES: (gx.T, gy.T), Fault.TRANSPOSED: (gy.T, gx.T)}
+        found |= {TableFault.PLACES: (gx.T, gy.T), TableFault.TRANSPOSED: (gy.T, gx.T)}
     return found
 
 
-def _kind(factor: float, u: float) -> Fault | None:
+def _kind(factor: float, u: float) -> TableFault | None:
     """Return what a factor says: None if it does not tell a correction from none."""
     if BEYOND * u >= max(1.0, abs(factor)):
         return None
-    for value, kind in ((1.0, Fault.NONE), (-1.0, Fault.SIGN), (0.0, Fault.OFF)):
+    for value, kind in ((1.0, TableFault.NONE), (-1.0, TableFault.SIGN), (0.0, TableFault.OFF)):
         if abs(factor - value) <= max(NEAR * abs(value), BEYOND * u):
             return kind
-    return Fault.FACTOR
+    return TableFault.FACTOR
 
 
-def _of_factors(factors: list[tuple[float, float]]) -> Fault:
+def _of_factors(factors: list[tuple[float, float]]) -> TableFault:
     """Return what the factors of x and y say together."""
     kinds = {kind for factor in factors if (kind := _kind(*factor)) is not None}
     if not kinds:
-        return Fault.OTHER
-    if Fault.FACTOR not in kinds:
-        return kinds.pop() if len(kinds) == 1 else Fault.AXES_DIFFER
+        return TableFault.OTHER
+    if TableFault.FACTOR not in kinds:
+        return kinds.pop() if len(kinds) == 1 else TableFault.AXES_DIFFER
     shown = [(value, u) for value, u in factors if _kind(value, u)]
     values, u = np.transpose(shown)
     apart = float(values.max() - values.min())
     if apart <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
-        return Fault.FACTOR
-    return Fault.OLDER if abs(values - 1).max() < SHARED else Fault.AXES_DIFFER
+        return TableFault.FACTOR
+    return TableFault.OLDER if abs(values - 1).max() < SHARED else TableFault.AXES_DIFFER
 
 
-def _theta_fault(maps: _Maps) -> Fault:
+def _theta_fault(maps: _Maps) -> TableFault:
     """Return what acts on the angle; NONE if too little is to be seen."""
     if maps.too_small:
-        return Fault.NONE
+        return TableFault.NONE
     if not maps.explained:
-        return Fault.OTHER
-    return _kind(*maps.factors[0]) or Fault.NONE
+        return TableFault.OTHER
+    return _kind(*maps.factors[0]) or TableFault.NONE

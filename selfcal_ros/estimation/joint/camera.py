@@ -20,7 +20,7 @@ from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding
@@ -67,7 +67,7 @@ class Distortion:
 
 
 @dataclass(frozen=True, eq=False)
-class Camera(Distortion):
+class FittedCamera(Distortion):
     """Errors of a camera: published minus true offset, as a function of the true one.
 
     Attributes
@@ -87,7 +87,7 @@ class Camera(Distortion):
         Noise shared by the marks of an image, and that of a mark, m.
     """
 
-    image: Image
+    image: ImageCells
     cells: Sequence[tuple[int, int]]
     place: np.ndarray
     error: np.ndarray
@@ -129,7 +129,7 @@ def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
     return np.stack([power[0], *(power[a] * power[b].conj() for a, b in powers)], axis=-1)
 
 
-def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
+def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | None:
     """Return the camera that a fit shows; None if its cells are too few, or lie in one line.
 
     A cell that one view lacks has the error that the others show, as they differ between cells.
@@ -169,7 +169,7 @@ def camera_of(measurements: Measurements, model: ModelFit) -> Camera | None:
         if np.array_equal(error, before):
             break
     moved = samples @ fit.T
-    return Camera(powers, fit @ error, image, cells, published - error, error, _spread(
+    return FittedCamera(powers, fit @ error, image, cells, published - error, error, _spread(
         samples - moved[:, :1]), _spread(moved), noises.image, noises.mark)
 
 
@@ -178,7 +178,7 @@ Layout = tuple[list[tuple[int, int]], np.ndarray, Callable[[np.ndarray], np.ndar
 function from offsets (..., views) to those of cells relative to the one nearest the axis."""
 
 
-def _layout(views: Sequence[View], image: Image, seen: np.ndarray) -> Layout | None:
+def _layout(views: Sequence[View], image: ImageCells, seen: np.ndarray) -> Layout | None:
     """Return how offsets of sub-views, those `seen`, depend on view and cell.
 
     A gap has the value that the least squares of both effects give it, so that means over the
@@ -301,7 +301,7 @@ def straight_products(products: np.ndarray, camera: Distortion, place: complex) 
     return change @ products @ change.T
 
 
-def few_read(measurements: Measurements, camera: Camera | None) -> tuple[Finding, ...]:
+def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[Finding, ...]:
     """Return a finding on the cells of images whose mark is missing in most images.
 
     Those of all views together, or of one.

@@ -133,7 +133,7 @@ the plan's own: there are several minima."""
 
 
 @dataclass(frozen=True)
-class Score:
+class PlanScore:
     """Predicted uncertainty of a plan for unit noise of one reading; infinite if deficient.
 
     `of_terms`: the deficiency is caused by free terms; without them the stage is identified.
@@ -206,7 +206,7 @@ class Search:
 class Suggestion(Step):
     """A next step with the resulting score of the plan."""
 
-    score: Score = field(kw_only=True)
+    score: PlanScore = field(kw_only=True)
 
 
 Progress = Callable[[int, int | None], None]
@@ -218,7 +218,7 @@ def no_progress(done: int, total: int | None = None) -> None:
 
 @one_thread()
 def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
-               repeats: int | None = None, against: Against | None = None) -> Score:
+               repeats: int | None = None, against: Against | None = None) -> PlanScore:
     """Return the score of a plan with every mark read.
 
     The unit of noise is an averaged reading of `repeats` repeats, by default the plan's fewest.
@@ -233,23 +233,23 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
         unseen = 0 if seen.identifiable else max(seen.deficiency, 1)
         unknown_sites = int((~system.known_sites).sum())
     if unseen:
-        return Score(unseen, inf, inf, inf)
+        return PlanScore(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
     found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
     if against is not None and against.every:
         terms = planned_equations(plan, system, against.every, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
-            return Score(hidden, inf, inf, inf, of_terms=True)
+            return PlanScore(hidden, inf, inf, inf, of_terms=True)
         found = with_part_of_terms(found, terms, repeats)
     theta = found.rms_theta if len(found.u_theta) else 0.0
-    return Score(0, found.rms_xy, found.max_xy, theta, unknown_sites=unknown_sites)
+    return PlanScore(0, found.rms_xy, found.max_xy, theta, unknown_sites=unknown_sites)
 
 
 @one_thread()
 def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
               against: Against | None = None, progress: Progress = no_progress
-              ) -> tuple[Score, list[Suggestion]]:
+              ) -> tuple[PlanScore, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
 
     Candidates are the views of `candidate_views`, another set of repeats of a view of the plan,
@@ -272,7 +272,7 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
     judged = smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > FULL_SIZE else plan
     unit = unit_repeats(plan)
 
-    def score(views: tuple[View, ...]) -> Score:
+    def score(views: tuple[View, ...]) -> PlanScore:
         return score_plan(replace(judged, views=views), datum, repeats=unit, against=against)
 
     views = more_views(plan)
@@ -296,7 +296,7 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
 def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
               like: View | None = None, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
               against: Against | None = None,
-              progress: Progress = no_progress) -> tuple[Plan, Score, Search]:
+              progress: Progress = no_progress) -> tuple[Plan, PlanScore, Search]:
     """Return the best plan of `n_views` views among the candidates, its score, and the search.
 
     The first view is the one without a turn: turning all views together only renames the marks.

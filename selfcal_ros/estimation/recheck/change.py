@@ -20,7 +20,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.maps import (
     DRAWS,
     USUAL_LEVEL,
-    Spread,
+    ReducedNoise,
     joint_dof,
     of_square,
     significance,
@@ -49,7 +49,7 @@ POWER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class ChangeTests(Spread):
+class ChangeTests(ReducedNoise):
     """Statistics of changes of a map, Gx first, then Gy, (2n,), without what the datum removes.
 
     Attributes
@@ -266,7 +266,7 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
         return Change(out[0], out[1], None)
     values, covariance, dof = _difference(new, common, np.eye(count), np.nan_to_num(old),
                                           plate=plate, dof=plate.result.noise.dof_theta)
-    spread = Spread(covariance, np.ones((len(values), 1)), dof)
+    spread = ReducedNoise(covariance, np.ones((len(values), 1)), dof)
     values = values - values.mean()
     out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
     test = significance(values, spread)

@@ -30,19 +30,19 @@ NAMED = 5
 """Sites and lines that are named one by one; the others are counted."""
 
 
-class Unit(NamedTuple):
+class DisplayUnit(NamedTuple):
     """Display unit of a quantity: factor from SI, and name."""
 
     per_si: float
     name: str
 
 
-UM, RATIO = Unit(UM_PER_M, "µm"), Unit(PPM_PER_ONE, "µm/m")
-MRAD, PERCENT = Unit(MRAD_PER_RAD, "mrad"), Unit(100.0, "%")
-ARCSEC, URAD = Unit(ARCSEC_PER_RAD, "arcsec"), Unit(URAD_PER_RAD, "µrad")
+UM, RATIO = DisplayUnit(UM_PER_M, "µm"), DisplayUnit(PPM_PER_ONE, "µm/m")
+MRAD, PERCENT = DisplayUnit(MRAD_PER_RAD, "mrad"), DisplayUnit(100.0, "%")
+ARCSEC, URAD = DisplayUnit(ARCSEC_PER_RAD, "arcsec"), DisplayUnit(URAD_PER_RAD, "µrad")
 
 
-def unit_of(name: str, si: str) -> Unit:
+def unit_of(name: str, si: str) -> DisplayUnit:
     """Return the display unit of the estimates of a term, or of the size of a cause.
 
     Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
@@ -50,10 +50,10 @@ def unit_of(name: str, si: str) -> Unit:
     block = blocks().get(name)
     if block is not None and (block.of_lines or block.of_images):
         return URAD
-    return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, Unit(1.0, si))
+    return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, DisplayUnit(1.0, si))
 
 
-def plus_minus(found: Finding, unit: Unit, times: float = 1.0) -> str:
+def plus_minus(found: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
     """Return size without sign, uncertainty with two digits, and unit of a finding.
 
     Parameters

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 from selfcal_ros.estimation.comparison.verification import (
     AxisError,
-    Fault,
+    TableFault,
     Verification,
     is_believed,
     verify,
@@ -17,23 +17,25 @@ from selfcal_ros.reporting.summary.numbers import aligned, significant
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 _FAULTS = {
-    Fault.OFF: "the correction does not act: the table is not switched on or not loaded, or its "
-               "unit is much too small",
-    Fault.SIGN: "the correction acts with the wrong sign: negate the table",
-    Fault.COMPONENTS: "the corrections of x and y are exchanged: the correction of x acts on y, "
-                      "and that of y on x",
-    Fault.PLACES: "the places of the table are exchanged: its rows are read as columns",
-    Fault.TRANSPOSED: "x and y are exchanged in the whole table: its places and its corrections",
-    Fault.MIRRORED_X: "the table acts mirrored along x: its order, or the direction of x",
-    Fault.MIRRORED_Y: "the table acts mirrored along y: its order, or the direction of y",
-    Fault.MIRRORED: "the table acts mirrored along x and y: its order, or both directions",
-    Fault.OTHER: "a correction acts that is not this map: another table is loaded, or its places "
-                 "are wrong",
-    Fault.OLDER: "a correction acts that is like this map but not this map: an older table is "
-                 "loaded, or the stage has changed since",
-    Fault.TOO_SMALL: "the map is not larger than its own uncertainty: there is nothing to verify"}
+    TableFault.OFF: "the correction does not act: the table is not switched on or not loaded, or "
+                    "its unit is much too small",
+    TableFault.SIGN: "the correction acts with the wrong sign: negate the table",
+    TableFault.COMPONENTS: "the corrections of x and y are exchanged: the correction of x acts on "
+                           "y, and that of y on x",
+    TableFault.PLACES: "the places of the table are exchanged: its rows are read as columns",
+    TableFault.TRANSPOSED: "x and y are exchanged in the whole table: its places and its "
+                           "corrections",
+    TableFault.MIRRORED_X: "the table acts mirrored along x: its order, or the direction of x",
+    TableFault.MIRRORED_Y: "the table acts mirrored along y: its order, or the direction of y",
+    TableFault.MIRRORED: "the table acts mirrored along x and y: its order, or both directions",
+    TableFault.OTHER: "a correction acts that is not this map: another table is loaded, or its "
+                      "places are wrong",
+    TableFault.OLDER: "a correction acts that is like this map but not this map: an older table is "
+                      "loaded, or the stage has changed since",
+    TableFault.TOO_SMALL: "the map is not larger than its own uncertainty: there is nothing to "
+                          "verify"}
 
-_ACTS = {Fault.OFF: "does not act", Fault.SIGN: "has the wrong sign"}
+_ACTS = {TableFault.OFF: "does not act", TableFault.SIGN: "has the wrong sign"}
 
 UNIT = {"x": ("µm", UM_PER_M), "y": ("µm", UM_PER_M), "theta": ("arcsec", ARCSEC_PER_RAD)}
 """Unit of an axis in a text, and how many of it are an SI unit."""
@@ -67,15 +69,15 @@ def verification_sentence(found: Verification) -> str:
 def _why(found: Verification) -> list[str]:
     """Return the further parts of the sentence."""
     parts = []
-    if found.fault is Fault.FACTOR:
+    if found.fault is TableFault.FACTOR:
         mean = sum(found.axes[name].factor for name in "xy") / 2
         parts.append(f"{significant(mean)} times the correction acts: look for a wrong unit or "
                      "scale of the table")
-    elif found.fault is Fault.AXES_DIFFER:
+    elif found.fault is TableFault.AXES_DIFFER:
         parts.append("the axes differ: " + ", ".join(
             f"{significant(found.axes[name].factor)} times the correction acts in {name}"
             for name in "xy") + ": compare their tables")
-    elif found.fault is not Fault.NONE:
+    elif found.fault is not TableFault.NONE:
         parts.append(_FAULTS[found.fault])
     elif found.remains:
         parts.append("more remains than the uncertainties explain: the stage has changed a little "
@@ -84,14 +86,14 @@ def _why(found: Verification) -> list[str]:
         parts.append("the correction acts as the map says" if found.better else
                      "the difference is within the uncertainties")
     theta = found.axes.get("theta")
-    if theta is not None and found.theta_fault is not Fault.NONE:
+    if theta is not None and found.theta_fault is not TableFault.NONE:
         parts.append(_of_theta(found.theta_fault, theta))
     return parts
 
 
-def _of_theta(fault: Fault, theta: AxisError) -> str:
+def _of_theta(fault: TableFault, theta: AxisError) -> str:
     """Return what is wrong with the correction of the angle."""
-    if fault is Fault.FACTOR:
+    if fault is TableFault.FACTOR:
         return f"that of θ acts {significant(theta.factor)} times"
     return f"that of θ {_ACTS.get(fault, 'is not that of this map')}"
 

@@ -13,7 +13,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import (
     Part,
-    Run,
+    RunValues,
     _families,
     _of_run,
     combine,
@@ -42,7 +42,7 @@ GTC_DOF = 7.518796992481201
 def run_of(values, variance, *, common=0.0, shares=True, dof=np.inf):
     values = np.asarray(values, dtype=float)
     n = len(values)
-    return Run(values, variance * np.eye(n), common * np.ones((n, n)), shares, dof)
+    return RunValues(values, variance * np.eye(n), common * np.ones((n, n)), shares, dof)
 
 
 def calibrated(seed, *, options=None, artifact=ARTIFACT, truth=None, sigma=2e-8):

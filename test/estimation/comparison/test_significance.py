@@ -13,7 +13,7 @@ from scipy.stats import t as student_t
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import (
     USUAL_LEVEL,
-    Spread,
+    ReducedNoise,
     _of_largest,
     compare,
     significance,
@@ -34,18 +34,18 @@ def test_the_distance_of_correlated_values_is_that_of_independent_ones_in_other_
     rng = np.random.default_rng(1)
     mixing, unit = rng.normal(size=(3, 3)), np.array([1.0, -2.0, 0.5])
     cover = mixing @ mixing.T
-    found = significance(mixing @ unit, Spread(cover, NOTHING, KNOWN))
+    found = significance(mixing @ unit, ReducedNoise(cover, NOTHING, KNOWN))
     assert found.dof == 3 and found.correlated
     assert found.chi2_ratio == pytest.approx((unit @ unit) / 3)
     assert found.p == pytest.approx(chi2.sf(unit @ unit, 3))
-    few = significance(mixing @ unit, Spread(cover, NOTHING, 7.0))
+    few = significance(mixing @ unit, ReducedNoise(cover, NOTHING, 7.0))
     assert few.p == pytest.approx(f_distribution.sf((unit @ unit) / 3, 3, 7))
 
 
 def test_what_the_datum_takes_out_does_not_count():
     """Of three equal variances about their mean two degrees of freedom are left, each 2/3."""
     values = np.array([1.0, 1.0, -2.0])
-    found = significance(values, Spread(np.eye(3), np.ones((3, 1)), KNOWN))
+    found = significance(values, ReducedNoise(np.eye(3), np.ones((3, 1)), KNOWN))
     assert found.dof == 2 and found.chi2_ratio == pytest.approx(3.0)
     assert found.largest_z == pytest.approx(2 / np.sqrt(2 / 3))
 
@@ -57,7 +57,7 @@ def test_every_column_that_was_taken_out_costs_a_degree_of_freedom(k):
     root, removed = rng.normal(size=(12, 12)), rng.normal(size=(12, k))
     contrasts = np.linalg.svd(removed)[0][:, k:].T
     values = contrasts.T @ rng.normal(size=12 - k)
-    found = significance(values, Spread(root @ root.T, removed, KNOWN))
+    found = significance(values, ReducedNoise(root @ root.T, removed, KNOWN))
     own = contrasts @ values
     square = own @ np.linalg.solve(contrasts @ root @ root.T @ contrasts.T, own)
     assert found.dof == 12 - k
@@ -71,21 +71,21 @@ def test_the_largest_of_independent_values_has_its_own_distribution():
     values[7] = -z
     exact = 1 - (1 - 2 * norm.sf(z)) ** n
     for cover in (np.eye(n), np.ones(n)):
-        found = significance(values, Spread(cover, np.zeros((n, 0)), KNOWN))
+        found = significance(values, ReducedNoise(cover, np.zeros((n, 0)), KNOWN))
         assert found.largest_z == pytest.approx(z)
         assert found.p_z == pytest.approx(exact, rel=0.15)
         p = (1 - (1 - USUAL_LEVEL / 2) ** (1 / n)) / 2
         assert found.z_limit == pytest.approx(norm.isf(p), rel=0.05)
         assert not found.significant
     values[7] = -6
-    found = significance(values, Spread(np.eye(n), np.zeros((n, 0)), KNOWN))
+    found = significance(values, ReducedNoise(np.eye(n), np.zeros((n, 0)), KNOWN))
     assert found.p_z == pytest.approx(2 * n * norm.sf(6)) and found.significant
 
 
 def test_values_that_move_together_count_once():
     n = 40
     cover = np.ones((n, n)) + 1e-12 * np.eye(n)
-    found = significance(np.full(n, 2.0), Spread(cover, np.zeros((n, 0)), KNOWN))
+    found = significance(np.full(n, 2.0), ReducedNoise(cover, np.zeros((n, 0)), KNOWN))
     assert found.p_z == pytest.approx(2 * norm.sf(2.0), abs=0.015)
     assert found.z_limit == pytest.approx(norm.isf(USUAL_LEVEL / 4), rel=0.12)
 
@@ -143,7 +143,7 @@ def test_nodes_that_move_together_are_as_one(noise_dof):
     """Of ten equal values the largest is Student's or normal itself, not one of ten."""
     alone = student_t(noise_dof) if np.isfinite(noise_dof) else norm
     limit = alone.isf(USUAL_LEVEL / 4)
-    drawn = Spread(np.ones((10, 10)), np.zeros((10, 0)), noise_dof).drawn
+    drawn = ReducedNoise(np.ones((10, 10)), np.zeros((10, 0)), noise_dof).drawn
     p, found = _of_largest(limit, 10, abs(drawn).max(axis=0), noise_dof)
     assert p == pytest.approx(USUAL_LEVEL / 2, abs=0.011)  # 3 sigma of 2000 draws
     assert found == pytest.approx(limit, rel=0.06)

@@ -10,7 +10,7 @@ from selfcal_ros.estimation import api
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import camera
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.model.pose import Image
+from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.view import View
@@ -131,7 +131,7 @@ def test_full_images_have_no_cell_with_few_readings():
 
 def test_gaps_have_the_value_of_the_other_views():
     """Offsets that are sums of one of the view and one of the cell are found without any gap."""
-    rng, image = np.random.default_rng(1), Image(3, 3, 1e-3)
+    rng, image = np.random.default_rng(1), ImageCells(3, 3, 1e-3)
     views = [part for name in "abc" for part in View(name, image=image).sub_views]
     of_view, of_cell = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (3, 9))
     offsets = (of_view[:, None] + of_cell).ravel()
