@@ -56,6 +56,7 @@ class CompensatingSession:
         self._editor = PositionEditor()
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
         self._skipped = self._commands_refused = self._outside = 0  # since then
+        self._strange: tuple[str, ...] = ()  # joints of the last sample without one of the stage
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = ""
@@ -122,11 +123,17 @@ class CompensatingSession:
         """
         self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
         method, fitted = self._settings.interpolation, None
-        if stated in get_args(Interpolation):
+        if stated and stated not in get_args(Interpolation):
+            raise InputError(f"the map of {source}", f"its interpolation {stated!r} is not known",
+                             f"known are {' and '.join(get_args(Interpolation))}")
+        if stated:
             fitted = cast(Interpolation, stated)
             method = fitted if error_map.valid.all() else "bilinear"
         use = Compensator(error_map, method=method, fitted=fitted, outside=self._settings.outside)
         self._refuse_large(error_map, *use.between(), source)
+        if stamp_ns < self._map_ns:
+            self._ports.say(Level.WARN, f"the map of {source} is older than the one that it "
+                            f"replaces, of {self._used}")
         self.compensator = use
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
@@ -200,12 +207,10 @@ class CompensatingSession:
     def command(self, data: bytes) -> bytes | None:
         """Return a commanded sensor_msgs/JointState with x, y and theta corrected.
 
-        None if it must not be passed on: without a map, damaged, where the map is unknown, with a
-        joint named twice, or with x or y alone, whose correction depends on the other.
+        None if it must not be passed on: without a map, damaged, or as `_corrected`.
         """
         sample, use, corrected = self._editor.read(data), self.compensator, None
-        if sample is not None and use is not None and (
-                (self._settings.joint_x in sample[0]) == (self._settings.joint_y in sample[0])):
+        if sample is not None and use is not None:
             corrected = self._corrected(*sample, (use.command, use.command_theta))
         if corrected is None:
             self.counts["commands_refused"] += 1
@@ -220,7 +225,8 @@ class CompensatingSession:
         """Return the positions of all joints with the stage's corrected; None if unknown.
 
         That is: outside the field with outside=refuse, next to an unknown site or line, no
-        position at all, or a joint named twice.
+        position at all, a joint named twice, none of the stage, or x or y alone, whose correction
+        depends on the other.
 
         Parameters
         ----------
@@ -235,6 +241,10 @@ class CompensatingSession:
         joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
         x, y, theta = map(place.get, joints)
         stage = [index for index in (x, y, theta) if index is not None]
+        if not stage:
+            self._strange = tuple(names)
+        if not stage or (x is None) != (y is None):
+            return None
         if self.compensator is None or not all(
                 abs(positions[index]) <= FARTHEST for index in stage):  # nor NaN
             return None
@@ -305,6 +315,12 @@ class CompensatingSession:
             lines.append(f"{refused} commands refused since the last status and not passed on: no "
                          "map, no complete position, a joint named twice, or a position where the "
                          "map is unknown")
+        strange, self._strange = self._strange, ()
+        if strange and (refused or not ages_s):  # beside samples of the stage they may be others
+            own = ", ".join((self._settings.joint_x, self._settings.joint_y,
+                             self._settings.joint_theta))
+            lines.append(f"joints {', '.join(strange)} are not of the stage ({own}): correct "
+                         "joint_x, joint_y and joint_theta, or the publisher")
         outside, self._outside = self._outside, 0
         if outside:
             lines.append(f"{outside} positions outside the field since the last status, corrected "
