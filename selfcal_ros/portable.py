@@ -8,6 +8,7 @@ same.
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from typing import TextIO
 
@@ -42,6 +43,10 @@ def hold_interrupts(*, held: bool) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
+class Ended(SystemExit):
+    """Raised where a signal ends the program."""
+
+
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block like an exception, so that it cleans up.
@@ -49,7 +54,7 @@ def ended_by_signals() -> Iterator[None]:
     One that is ignored stays so: `nohup` lets a command outlive its terminal.
     """
     def end(number: int, _: object) -> None:
-        raise SystemExit(128 + number)
+        raise Ended(128 + number)
     ends = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {number: signal.signal(number, end) for number in ends
               if signal.getsignal(number) is not signal.SIG_IGN}
@@ -58,6 +63,36 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class Overdue(BaseException):
+    """Raised where a block takes longer than it may; no handler of errors catches it."""
+
+
+@contextlib.contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Interrupt the block if it takes longer, also where it waits for a system call.
+
+    In the main thread only, and where the system has such an alarm: else it waits for good.
+
+    Raises
+    ------
+    Overdue
+        After so many seconds.
+    """
+    def ring(*_: object) -> None:
+        raise Overdue("no answer")
+    if not hasattr(signal, "setitimer") or (
+            threading.current_thread() is not threading.main_thread()):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def say_no_more(*streams: TextIO) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.machine.interface import MachineError
+from selfcal_ros.portable import Ended
 
 
 def called(where: str, function: Callable[..., Any], *values: Any,
@@ -26,13 +27,14 @@ def called(where: str, function: Callable[..., Any], *values: Any,
     Raises
     ------
     MachineError
-        For any error that is not one of this package, with the line of Python that raised it.
+        For any error that is not one of this package, with the line of Python that raised it; also
+        for the end of the program, unless a signal asks for that.
     """
     try:
         return function(*values, **more)
-    except (SelfcalError, ModuleNotFoundError):
+    except (SelfcalError, ModuleNotFoundError, Ended):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
         in_python = frame.filename != __file__  # else it was raised by a library in C
         place = f" ({Path(frame.filename).name}, line {frame.lineno})" if in_python else ""

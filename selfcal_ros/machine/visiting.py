@@ -26,6 +26,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import line_targets, stage_targets, visit_sequence
+from selfcal_ros.portable import Overdue, interrupted_after
 from selfcal_ros.topics import IMAGE_TOPICS
 from selfcal_ros.units import NS_PER_S, UM_PER_M
 
@@ -37,6 +38,8 @@ TINY = 1e-15
 """Least tolerance, m or rad: one of 0 is allowed."""
 TRIES = 3
 """Exposures that are tried at a stop whose position changes meanwhile."""
+ANSWER_S = 60.0
+"""Longest wait for an answer of the machine, beside `settle: patience`: for its slowest move."""
 EMPTY_STOPS = 5
 """Stops one after another at which nothing is seen, after which a view is given up."""
 FIRST_TURN_RAD = 0.01
@@ -165,8 +168,15 @@ class Visitor:
         self._ask("stop")
 
     def _ask(self, name: str, *values: Any) -> Any:
-        """Call a method of the machine; its errors become MachineError."""
-        return called(f"machine.{name}", getattr(self.machine, name), *values)
+        """Call a method of the machine; its errors, and no answer, become MachineError."""
+        where, longest_s = f"machine.{name}", ANSWER_S + self.cell.settle.patience
+        try:
+            with interrupted_after(longest_s):
+                return called(where, getattr(self.machine, name), *values)
+        except Overdue as error:
+            raise MachineError(f"it has not answered for {longest_s:g} s", where, "check cables, "
+                               "power and the driver; for longer moves raise settle: patience"
+                               ) from error
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -176,8 +186,9 @@ class Visitor:
         except BaseException as error:
             self._has_moved = False  # the next move is a small one again
             try:
-                self.machine.stop()
-            except Exception as failed:
+                with interrupted_after(ANSWER_S):
+                    self.machine.stop()
+            except (Exception, Overdue) as failed:
                 raise MachineError(f"{str(error) or 'interrupted'}; and it cannot be stopped "
                                    f"({first_line(failed)})", "machine.stop",
                                    "use the emergency stop") from error
@@ -368,6 +379,7 @@ class Visitor:
             moved = _difference(before, now)
             away = {axis: value - goal[axis]
                     for axis, value in zip(self.axes, now.positions, strict=True)}
+            self._check_limits(start, goal, now)
             rests = self._rests(moved)
             arrived = all(abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded)
             if rests and arrived:
@@ -378,8 +390,18 @@ class Visitor:
             if now.stamp_ns > deadline_ns:
                 raise self._not_at_rest(before, now) if not rests else self._astray(
                     start, goal, {axis: away[axis] for axis in self.axes if axis in commanded
-                                  or axis != "theta"})
+                                  or axis != "theta"}, f"after {settle.patience:g} s")
             before = now
+
+    def _check_limits(self, start: Position, goal: Position, now: EncoderSample) -> None:
+        """Raise if an axis leaves its limits, beyond where it was and where it is to go."""
+        for axis, value in zip(self.axes, now.positions, strict=True):
+            low, high = self.cell.limits.get(axis, (-math.inf, math.inf))
+            at, *ends = (self.cell.to_machine(axis, place)
+                         for place in (value, start[axis], goal[axis]))
+            near = self.cell.settle.of(axis, "arrival")
+            if not min(low, *ends) - near <= at <= max(high, *ends) + near:
+                raise self._astray(start, goal, {axis: value - goal[axis]}, "beyond its limits")
 
     def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
         self._check_axes(before, now)
@@ -399,15 +421,18 @@ class Visitor:
                                "axis", "machine.position", "wait for each answer before the next "
                                "question; drop what is left of old answers")
 
-    def _astray(self, start: Position, goal: Position, away: Position) -> MachineError:
-        axis = self._farthest({axis: value for axis, value in away.items()
-                               if goal[axis] != start[axis]} or away)
+    def _astray(self, start: Position, goal: Position, away: Position,
+                when: str) -> MachineError:
+        moving = {axis: value for axis, value in away.items() if goal[axis] != start[axis] and (
+            abs(value) > self.cell.settle.of(axis, "arrival"))}
+        axis = self._farthest(moving or away)
         other = {"x": "y", "y": "x"}.get(axis, "")
-        at = goal[axis] + away[axis]
-        reason = _reason(axis, goal[axis] - start[axis], at - start[axis], away.get(other, 0.0))
+        at, step = goal[axis] + away[axis], goal[axis] - start[axis]
+        reason = _reason(axis, step, at - start[axis], away.get(other, 0.0)) if (
+            abs(step) > self.cell.settle.of(axis, "within")) else ""
         return MachineError(
-            f"{axis} was sent to {goal[axis]:.6g} and indicates {at:.6g} after "
-            f"{self.cell.settle.patience:g} s, {_shown(axis, away[axis])} away"
+            f"{axis} was sent to {goal[axis]:.6g} and indicates {at:.6g} {when}, "
+            f"{_shown(axis, away[axis])} away"
             f"{reason and ': '}{reason}", "machine", "check drives, limit switches and the unit of "
             "the positions, or raise settle: arrival")
 

@@ -3,6 +3,8 @@
 
 import errno
 import re
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +15,7 @@ from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.machine import MachineError
+from selfcal_ros.machine import MachineError, visiting
 from selfcal_ros.machine.clock import Clock
 from test.machine.test_measuring import away_from, run_of
 from test.support.cells import PLAN, Agreeing, Jumping, write_cell
@@ -206,6 +208,56 @@ def test_a_class_that_returns_something_else(tmp_path, name, value, said):
     setattr(machine, name, lambda: value)
     with pytest.raises(MachineError, match=said):
         run_of(tmp_path, machine, cell).measure()
+
+
+@pytest.mark.parametrize("name", ["move_to", "position", "offsets"])
+def test_a_device_that_never_answers_is_stopped_and_named(tmp_path, monkeypatch, name):
+    cell, machine = write_cell(tmp_path)
+    spoilt = Spoilt(machine, "")
+    answer = getattr(spoilt, name)
+
+    def silent(*values):
+        if len(spoilt.moves) > ONSET:
+            time.sleep(100)
+        return answer(*values)
+
+    monkeypatch.setattr(spoilt, name, silent)
+    monkeypatch.setattr(visiting, "ANSWER_S", 0.2)
+    quick = replace(cell, settle=replace(cell.settle, patience=1.0))
+    with pytest.raises(MachineError, match=rf"machine.{name}: it has not answered for 1.2 s"):
+        run_of(tmp_path, spoilt, quick).measure()
+    assert spoilt.stops
+
+
+def test_a_stop_that_never_answers_is_said(tmp_path, monkeypatch):
+    cell, machine = write_cell(tmp_path)
+    spoilt = Spoilt(machine, "connection lost in a move", ONSET)
+    monkeypatch.setattr(spoilt, "stop", lambda: time.sleep(100))
+    monkeypatch.setattr(visiting, "ANSWER_S", 0.2)
+    with pytest.raises(MachineError, match=r"cannot be stopped .no answer.; use the emergency"):
+        run_of(tmp_path, spoilt, cell).measure()
+
+
+def test_a_driver_that_ends_the_program_is_an_error(tmp_path, monkeypatch):
+    cell, machine = write_cell(tmp_path)
+    monkeypatch.setattr(machine, "move_to", lambda _: sys.exit(0))
+    with pytest.raises(MachineError, match=r"machine\.move_to: SystemExit: 0"):
+        run_of(tmp_path, machine, cell).measure()
+
+
+def test_a_stage_that_runs_away_is_stopped_at_once_and_the_axis_named(tmp_path, monkeypatch):
+    cell, machine = write_cell(tmp_path)
+    spoilt = Spoilt(machine, "")
+    position = spoilt.position
+
+    def far():
+        x, *others = position()
+        return (0.2 if len(spoilt.moves) > ONSET else x, *others)
+
+    monkeypatch.setattr(spoilt, "position", far)
+    with pytest.raises(MachineError, match=r"x was sent to \S+ and indicates 0.2 beyond its lim"):
+        run_of(tmp_path, spoilt, cell).measure()
+    assert spoilt.stops and len(spoilt.moves) == ONSET + 1
 
 
 def test_a_stage_that_cannot_be_stopped_is_said(tmp_path):
