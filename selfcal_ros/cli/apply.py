@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
                  outside="refuse" if args.outside == "refuse" else "clamp")
     points = read_points(read_text(args.points), args.points)
     edge = args.outside == "edge"
-    refuse_other_unit(stage, points, args.points, edge=edge)
+    refuse_other_unit(stage, points, args.points)
     table = distances if points.shape[1] == len(ENDS) else corrected
     text, unknown, outside = table(stage, points, inverse=args.inverse, edge=edge)
     _say_better(stage, points)
@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     return int(ExitCode.NOT_QUALIFIED) if outside and not edge else code
 
 
-def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str, *, edge: bool) -> None:
-    """Refuse points that all lie outside the field; with `edge` only those that lie far outside.
+def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
+    """Refuse points that all lie outside the field, and some of them far.
 
     The origin is in the field in any unit.
 
@@ -84,7 +84,7 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str, *, edge: 
     plate = stage.error_map.artifact
     half = np.array(plate.half) * plate.grid_pitch_m
     beyond = (np.abs(places) / half).max(axis=1, initial=0.0)
-    if not len(places) or stage.inside(*places.T).any() or (edge and beyond.max() <= FAR):
+    if not len(places) or stage.inside(*places.T).any() or beyond.max() <= FAR:
         return
     x, y = half * MM_PER_M
     farthest = places[beyond.argmax()]

@@ -139,7 +139,7 @@ def test_beyond_the_edge_nothing_is_known(desk, capsys, inverse):
 
 @pytest.mark.parametrize(("text", "words", "code"), [
     ("x,y\n10,-5\n0,0\n", (), 2), ("x,y\n10,-5\n0,0\n", ("--outside", "edge"), 2),
-    ("x1,y1,x2,y2\n10,-5,0,0\n", (), 2), ("x,y\n0.021,0\n0,0\n", (), 2),
+    ("x1,y1,x2,y2\n10,-5,0,0\n", (), 2), ("x,y\n0.021,0\n0,0\n", (), 5),
     ("x,y\n0.021,0\n0,0\n", ("--outside", "edge"), 0), ("x,y\n10,-5\n0.01,0\n", (), 5),
     ("x,y\n0,0\n", (), 0)])
 def test_points_in_mm_are_asked_about(desk, capsys, text, words, code):
