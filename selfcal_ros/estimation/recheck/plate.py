@@ -228,9 +228,6 @@ def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarr
     return rows[:, known.ravel()], inside
 
 
-MANY = 5.0
-"""Median difference, in standard uncertainties, beyond which most marks differ."""
-
 LEAST = 0.01
 """Part of the known errors of the marks by which those of another plate differ at least."""
 
@@ -307,7 +304,7 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
         other = _other_pose(seen, plate.field, measurements.artifact)
         if other is not None:
             raise said(_misplaced(view, seen, other), f"plan '{measurements.plan_id}', ")
-        if many > MANY and _of_marks(seen.marks[here], rest, seen.u):
+        if _of_marks(seen.marks[here], rest, seen.u):
             return Finding("other_plate", _size(rest), seen.u, "m",
                            view=view.view.name, details={"times": many, "of": plate.where})
     return None
@@ -373,8 +370,8 @@ def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
     """Return whether what is left is of the marks: a stage alone changes continuously.
 
     Both are normal: of the stage with a correlation that falls with the distance, exponentially, of
-    the marks each by itself. That the part of the marks is more than `MANY` u must be likelier than
-    that it is not. Sizes and lengths are tried by halves and doubles, with the best scale.
+    the marks each by itself. That the part of the marks contradicts u must be likelier than that it
+    does not. Sizes and lengths are tried by halves and doubles, with the best scale.
     Single marks that are far off count as far off as others.
     """
     away = np.abs(marks[:, None] - marks)
@@ -387,7 +384,7 @@ def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
         for own in 2.0 ** np.arange(-20, 20):
             variance = np.mean(power / (alike + own)) / 2
             likelihood = -len(rest) * np.log(variance) - np.log(alike + own).sum()
-            differs = bool(np.sqrt(own * variance) > MANY * u)
+            differs = bool(own * variance > CONTRADICTED * u**2)
             best[differs] = max(best[differs], float(likelihood))
         length *= 2
     return best[True] > best[False]

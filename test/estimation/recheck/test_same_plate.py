@@ -13,6 +13,7 @@ from selfcal_ros.estimation.recheck import plate as of_plate
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
@@ -87,6 +88,17 @@ def test_another_plate_is_not_a_changed_stage(sense):
     assert result.verdict.grade is Grade.NOT_QUALIFIED and not result.findings
     assert "another plate, or the plate has changed" in result.verdict.sentence
     assert "check which plate it is" in result.verdict.sentence
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_plate_of_the_same_drawing_is_another_plate_though_it_differs_little(seed):
+    """By five u of its marks each: the map would be as far off, and its U not."""
+    truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
+    marks = plate.result.artifact_map
+    u = rms(np.stack([marks.u_ax, marks.u_ay, plate.result.error_map.u_gx]))
+    rng = np.random.default_rng(seed)
+    other = once_more(Sense.MICROSCOPE_MOVES, a=truth.a + rng.normal(0, 5 * u, truth.a.shape))
+    assert [found.name for found in recheck(other, BARE, plate).verdict.failed] == ["other_plate"]
 
 
 @pytest.mark.parametrize("seed", range(5))
