@@ -59,6 +59,11 @@ class Driver:
         self._thread.start()
 
     @property
+    def trouble(self) -> str:
+        """The problem, or that the machine does not answer; empty if all is well."""
+        return self.problem or str(self._visitor.silence or "")
+
+    @property
     def busy(self) -> bool:
         """Whether it is placing or visiting."""
         with self._turn:

@@ -160,6 +160,7 @@ class Visitor:
         self._untold: list[EncoderSample] = []  # of moves
         self._has_moved = False
         self._told_ns = 0  # newest stamp of a position
+        self._asked: tuple[str, int] | None = None  # what the machine has to answer, and since when
         self.stopped = False
 
     def stop(self) -> None:
@@ -169,14 +170,31 @@ class Visitor:
 
     def _ask(self, name: str, *values: Any) -> Any:
         """Call a method of the machine; its errors, and no answer, become MachineError."""
-        where, longest_s = f"machine.{name}", ANSWER_S + self.cell.settle.patience
+        where, before = f"machine.{name}", self._asked
+        self._asked = (where, self.clock.now_ns())
         try:
-            with interrupted_after(longest_s):
+            with interrupted_after(self._longest_s):
                 return called(where, getattr(self.machine, name), *values)
         except Overdue as error:
-            raise MachineError(f"it has not answered for {longest_s:g} s", where, "check cables, "
-                               "power and the driver; for longer moves raise settle: patience"
-                               ) from error
+            raise self._silent(where) from error
+        finally:
+            self._asked = before
+
+    @property
+    def _longest_s(self) -> float:
+        return ANSWER_S + self.cell.settle.patience
+
+    def _silent(self, where: str) -> MachineError:
+        return MachineError(f"it has not answered for {self._longest_s:g} s", where, "check "
+                            "cables, power and the driver; for longer moves raise settle: patience")
+
+    @property
+    def silence(self) -> MachineError | None:
+        """What has not been answered for too long; only in the main thread is it given up."""
+        asked = self._asked
+        if asked is None or (self.clock.now_ns() - asked[1]) / NS_PER_S <= self._longest_s:
+            return None
+        return self._silent(asked[0])
 
     @contextmanager
     def stopping(self) -> Iterator[None]:

@@ -39,8 +39,8 @@ class CellDriver(CellNode[DriverSettings]):
 
     def diagnosis(self) -> Diagnosis:
         """Return what the machine does, or why it stands still."""
-        if self._driver.problem:
-            return Diagnosis(Level.ERROR, self._driver.problem, self.sent)
+        if self._driver.trouble:
+            return Diagnosis(Level.ERROR, self._driver.trouble, self.sent)
         return Diagnosis(Level.OK, "measuring" if self._driver.busy else "at rest", self.sent)
 
     def close(self) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What cell_driver does with the commands of a run."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,6 +66,23 @@ def test_a_plate_is_placed_though_the_command_to_measure_follows_at_once(cell):
     command(Phase.PLACE, Phase.MEASURE)
     assert placed == ["identity"] and not said
     assert any(isinstance(event, Detection) for event in driver.events)
+
+
+def test_a_machine_that_does_not_answer_is_named_until_it_does(cell):
+    driver, _, machine, _ = cell
+    position, asked, answers = machine.position, threading.Event(), threading.Event()
+
+    def silent():
+        asked.set()
+        answers.wait()
+        return position()
+    machine.position = silent
+    asked.wait()
+    assert not driver.trouble
+    driver._clock.sleep(75.0)
+    assert driver.trouble.startswith("machine.position: it has not answered for 61 s; check")
+    answers.set()
+    wait_until(lambda: not driver.trouble, "an answer")
 
 
 def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
