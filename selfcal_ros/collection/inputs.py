@@ -317,8 +317,8 @@ REMEDY = {
                     "how many an image shows (image: {nx: 3, ny: 3}), or publish only the mark "
                     "nearest to the optical axis",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
-    Reason.OUTLIER: "repeats of a mark contradict each other; check that each id belongs to one "
-                    "mark, or raise outlier_limit",
+    Reason.OUTLIER: "repeats of a mark contradict each other; check the stage for backlash, that "
+                    "each id belongs to one mark, or raise outlier_limit",
 }
 """Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 

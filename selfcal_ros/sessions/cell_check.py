@@ -22,6 +22,7 @@ from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
+from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.cell_faults import explaining
 from selfcal_ros.sessions.health import Ports
@@ -354,7 +355,8 @@ class CellCheck:
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
         self._tell("rest", not moving, f"{moving} of {total} exposures while the stage moved, or "
                    "without samples around them", REMEDY[Reason.MOVING])
-        bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
+        bad = sum(count for reason, count in rejected.items() if reason in REMEDY
+                  and reason != Reason.OUTLIER)  # offsets in any unit contradict each other less
         fault = explaining(self._command, self._events, self._settings) if bad else None
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
@@ -382,6 +384,7 @@ class CellCheck:
                    or "measure every mark `repeats` times; publish reliable, depth 1000")
         self._tell("check stops", progress.check_done >= progress.check_expected,
                    f"{progress.check_done} of {progress.check_expected} marks from all four sides",
+                   REMEDY[Reason.OUTLIER] if rejected.get(Reason.OUTLIER) else
                    "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
                    "(docs/start/cell.md)")
 
@@ -428,6 +431,12 @@ class CellCheck:
             what = f"the offsets are turned by {turned:+.1f}° against the stage"
             remedy = ("publish offsets along the stage's axes: turn the camera back by this angle, "
                       "or state it (detector: turn)")
+        factor = max((abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1))
+        if shown and stops and not faults and abs(factor - 1) > block_of_offsets().plausible:
+            shown = False
+            what = f"the offsets are {factor:.3g} times as large as the motion of the stage"
+            remedy = ("divide pixel_size by this factor, or find it with selfcal camera init: no "
+                      "map would be qualified")
         self._tell("signs", shown and not faults,
                    what or f"offset against stage {figure or 'not known'} (-1 expected)",
                    remedy or "let the stage stop off the marks: check stops")

@@ -31,6 +31,7 @@ class Cell(Bench):
         self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
         self.planned = iter(())  # a view without an end is exposed only until it is aborted
         self.view, self.position, self.late = None, self.home, []  # in transit
+        self.came = 1.0  # sign of the last motion along x
 
     def obey(self, fields):
         """Act on a command, once."""
@@ -64,7 +65,8 @@ class Cell(Bench):
         """Publish the encoder, and the detection that is due."""
         now = self.hands.seconds
         if self.work and now >= self.begun_s:
-            self.position = self.work[0][0]
+            before, self.position = self.position[0], self.work[0][0]
+            self.came = np.sign(self.position[0] - before) or self.came
         self.check.take_encoder(self.encoder(now))
         while self.late and self.late[0][0] <= now:
             self.check.take_detection(self.late.pop(0)[1])
@@ -104,6 +106,10 @@ class Cell(Bench):
             seen = seen | {"offset_x": -seen["offset_x"]}
         if self.fault == "offsets in mm":
             seen = seen | {key: 1e3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "pixels too large":
+            seen = seen | {key: 1.3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "backlash":
+            seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
         if self.fault == "m and n exchanged":
             seen = seen | {"m": seen["n"], "n": seen["m"]}
         seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
@@ -146,6 +152,8 @@ WRONG = [
     ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
     ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
     ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
+    ("pixels too large", "signs", "the offsets are 1.3 times as large as the motion of the stage"),
+    ("backlash", "marks", "16 outlier_among_repeats"),
     ("m and n exchanged", "ids", "m and n are exchanged"),
     ("x and y exchanged", "ids", "x and y are exchanged"),
     ("millimetres", "ids", "the indicated positions are 1000 times those of the marks"),
@@ -161,6 +169,8 @@ WRONG = [
 
 
 REMEDIES = {"arrives late": "publish each detection as soon as it is found",
+            "pixels too large": "divide pixel_size by this factor",
+            "backlash": "repeats of a mark contradict each other; check the stage for backlash",
             "old stamps": "stamp detections at the instant of exposure",
             "x and y exchanged": "exchange joint_x and joint_y", "reversed x": "reverse the sign"}
 
