@@ -25,6 +25,9 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.cell_check import CellCheck
 from selfcal_ros.sessions.health import Level
 
+OF_A_CELL = ("cell_driver", "mark_detector")
+"""Nodes of this package that are part of a cell."""
+
 
 class CellChecker(SelfcalNode[CollectorSettings]):
     """Command a cell like a sequencer and check its messages."""
@@ -40,7 +43,12 @@ class CellChecker(SelfcalNode[CollectorSettings]):
             settle_s=settle_s, patience_s=patience_s)
         MatchedInput(self, names.ENCODER_EITHER, self.session.take_encoder)
         self.subscribe(names.DETECTIONS, self.session.take_detection)
+        for node in OF_A_CELL:
+            self.subscribe(names.of_node(node, names.HEALTH), partial(self._take_health, node))
         self.every(0.02, self._tick)
+
+    def _take_health(self, node: str, message: Any) -> None:
+        self.session.take_health(node, message.level[0], message.message)
 
     def _tick(self) -> None:
         if self.finished.done():

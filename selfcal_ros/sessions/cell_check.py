@@ -25,7 +25,7 @@ from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.cell_faults import explaining
-from selfcal_ros.sessions.health import Ports
+from selfcal_ros.sessions.health import Level, Ports
 from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
@@ -132,6 +132,7 @@ class CellCheck:
         self._samples: list[tuple[int, int]] = []  # stamp, and age at its reception, ns
         self._seen: list[tuple[float, int, bool]] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
+        self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run()
@@ -153,6 +154,12 @@ class CellCheck:
                            found.has_id))
         self._collector.add_detection(found)
         self._events.append(found)
+
+    def take_health(self, node: str, level: int, line: str) -> None:
+        """Take the health of a node of the cell: its level, and what is wrong."""
+        self._errors.pop(node, None)
+        if level >= Level.ERROR:
+            self._errors[node] = line
 
     def tick(self) -> None:
         """Perform due work."""
@@ -188,11 +195,15 @@ class CellCheck:
         command = yield from self._place_and_measure(replace(self.view, repeats=ENDLESS))
         first = len(self._seen)
         if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
+            figure = f"{len(self._seen) - first} detections in {self._patience_s:g} s after MEASURE"
+            remedy = ("subscribe selfcal/view_command reliable and transient local, act on "
+                      "MEASURE, publish stage/mark_detections reliable")
+            if self._errors:  # a node of the cell knows better
+                node, error = next(iter(self._errors.items()))
+                what, _, remedy = error.partition("; ")
+                figure = f"{figure}: {node}: {what}"
             self._send(Phase.ABORT)
-            self._tell("commands", False, f"{len(self._seen) - first} detections in "
-                       f"{self._patience_s:g} s after MEASURE", "subscribe selfcal/view_command "
-                       "reliable and transient local, act on MEASURE, publish "
-                       "stage/mark_detections reliable")
+            self._tell("commands", False, figure, remedy)
             return None
         aborted = self._send(Phase.ABORT)
         self._pause_s = self._longest_pause_s()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.sessions.cell_check import CellCheck, CheckItem, grouped
+from selfcal_ros.sessions.health import Level
 from test.support.bench_cell import Bench
 from test.support.ports import Hands, settings_of
 from test.support.sessions import small_plan
@@ -183,6 +184,23 @@ def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, f
     assert first.remedy.startswith(REMEDIES.get(fault, ""))
     assert first.remedy
     assert {(item.follows, item.remedy) for item in others} <= {(name, "")}
+
+
+def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
+    hands = Hands()
+    bench = Cell("stands still", hands)
+    check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
+                                    hands.ports, settle_s=0.2, patience_s=5.0)
+    check.take_health("mark_detector", Level.ERROR, "no image")
+    check.take_health("mark_detector", Level.OK, "")
+    check.take_health("cell_driver", Level.ERROR, "first move: x is reversed; correct turn")
+    while not check.done:
+        check.tick()
+        bench.tick()
+        hands.pass_time(TICK_S)
+    assert check.items[-1] == CheckItem(
+        "commands", False, "0 detections in 5 s after MEASURE: cell_driver: first move: x is "
+        "reversed", "correct turn")
 
 
 def test_two_publishers_are_the_only_fault():
