@@ -73,7 +73,8 @@ class Overdue(BaseException):
 def interrupted_after(seconds: float) -> Iterator[None]:
     """Interrupt the block if it takes longer, also where it waits for a system call.
 
-    In the main thread only, and where the system has such an alarm: else it waits for good.
+    In the main thread only, where the system has such an alarm and no library has taken it: else
+    it waits for good.
 
     Raises
     ------
@@ -82,17 +83,18 @@ def interrupted_after(seconds: float) -> Iterator[None]:
     """
     def ring(*_: object) -> None:
         raise Overdue("no answer")
-    if not hasattr(signal, "setitimer") or (
-            threading.current_thread() is not threading.main_thread()):
+    is_main = threading.current_thread() is threading.main_thread()
+    if not (is_main and hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM)
+            is signal.SIG_DFL):
         yield
         return
-    before = signal.signal(signal.SIGALRM, ring)
+    signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
 def say_no_more(*streams: TextIO) -> None:

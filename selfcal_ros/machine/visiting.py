@@ -166,11 +166,14 @@ class Visitor:
     def stop(self) -> None:
         """Stop the machine, and whatever is being visited; may be called from another thread."""
         self.stopped = True
-        self._ask("stop")
+        called("machine.stop", self.machine.stop)
 
     def _ask(self, name: str, *values: Any) -> Any:
-        """Call a method of the machine; its errors, and no answer, become MachineError."""
-        where, before = f"machine.{name}", self._asked
+        """Call a method of the machine; its errors, and no answer, become MachineError.
+
+        One after another: `stop` alone comes from other threads, and is not asked for here.
+        """
+        where = f"machine.{name}"
         self._asked = (where, self.clock.now_ns())
         try:
             with interrupted_after(self._longest_s):
@@ -178,7 +181,7 @@ class Visitor:
         except Overdue as error:
             raise self._silent(where) from error
         finally:
-            self._asked = before
+            self._asked = None
 
     @property
     def _longest_s(self) -> float:

@@ -85,6 +85,31 @@ def test_a_machine_that_does_not_answer_is_named_until_it_does(cell):
     wait_until(lambda: not driver.trouble, "an answer")
 
 
+def test_a_machine_that_is_stopped_while_it_is_asked_is_not_silent_later(cell):
+    """What it was asked is answered before the call of stop returns."""
+    driver, _, machine, _ = cell
+    stop, position, answers = machine.stop, machine.position, threading.Event()
+    asked, answered = threading.Event(), threading.Event()
+
+    def late():
+        if not asked.is_set():
+            asked.set()
+            answers.wait()
+        return position()
+
+    def stops_and_waits():
+        stop()
+        answers.set()
+        wait_until(lambda: driver._visitor._asked is None, "the answer")
+        answered.set()
+    machine.position, machine.stop = late, stops_and_waits
+    asked.wait()
+    driver._visitor.stop()
+    assert answered.is_set()
+    driver._clock.sleep(75.0)
+    wait_until(lambda: not driver.trouble, "another answer")
+
+
 def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
     """The positions on the way to it begin where the stage has stood meanwhile."""
     driver, _, _, command = cell
