@@ -47,12 +47,15 @@ from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_
 from selfcal_ros.estimation.terms.equations import reduce_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
-from selfcal_ros.estimation.verdict.leverage import noise_of
+from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, noise_of
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import Plan
+
+READINGS_DRAWN = 2_000_000
+"""Largest number of readings in all draws together, 200 MB: larger fields vary less."""
 
 TOGETHER = 20_000
 """Number of readings computed at once: several draws of a small field, one of a large one."""
@@ -231,14 +234,15 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     """
     grid = model.problem.system.grid
     rng = np.random.default_rng(0)
-    noise = noise_of(rng, (N_DRAWS, *grid.weight.shape), grid.weight)
+    n = int(np.clip(READINGS_DRAWN // grid.weight.size, FEW_DRAWS, N_DRAWS))
+    noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
-    own = noise_of(rng, (N_DRAWS, *weight.shape), weight)
-    own_terms = rng.standard_normal((len(held.own), N_DRAWS)) / max(model.found.xy.sigma, FLOOR)
+    own = noise_of(rng, (n, *weight.shape), weight)
+    own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, FLOOR)
     views = maps_of(held.grid)
-    squares = np.zeros(N_DRAWS)
+    squares = np.zeros(n)
     step = max(TOGETHER // grid.weight.size, 1)
-    for draws in (slice(first, first + step) for first in range(0, N_DRAWS, step)):
+    for draws in (slice(first, first + step) for first in range(0, n, step)):
         field = fields[:, draws].T.reshape(-1, *grid.views.shape)
         taken = noise[draws]
         if model.equations is not None:
