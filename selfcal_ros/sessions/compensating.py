@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros import results
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.compensator import Compensator, Interpolation
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap
@@ -319,8 +319,8 @@ class CompensatingSession:
         if strange and (refused or not ages_s):  # beside samples of the stage they may be others
             own = ", ".join((self._settings.joint_x, self._settings.joint_y,
                              self._settings.joint_theta))
-            lines.append(f"joints {', '.join(strange)} are not of the stage ({own}): correct "
-                         "joint_x, joint_y and joint_theta, or the publisher")
+            lines.append(f"joints {printable(', '.join(strange))} are not of the stage ({own}): "
+                         "correct joint_x, joint_y and joint_theta, or the publisher")
         outside, self._outside = self._outside, 0
         if outside:
             lines.append(f"{outside} positions outside the field since the last status, corrected "

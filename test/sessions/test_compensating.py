@@ -455,6 +455,13 @@ def test_samples_that_cannot_be_read_are_refused_and_those_behind_them_corrected
     assert (busy.session.counts["refused"], busy.session.counts["corrected"]) == (4, 1)
 
 
+def test_names_of_joints_do_not_spoil_the_diagnosis(desk):
+    use(desk)
+    assert desk.session.correct(["\x1b[2J\n", "x" * 10**6], [0.0, 0.0]) is None
+    told = desk.session.diagnosis().message
+    assert told.isprintable() and len(told) < 10_000
+
+
 def test_another_axis_beside_the_stage_is_no_fault(busy):
     found = corrected(busy, [sample(1), sample(2, names=["z", "w", "v"]), sample(3)])
     assert numbers(found) == [1, 3]
