@@ -142,7 +142,7 @@ ALL_KEYWORDS = set().union(*KEYWORDS.values())
 POSITIONAL: dict[TableKind, tuple[str, ...]] = {
     TableKind.ONE_D: ("axis_index",),
     TableKind.TWO_D: ("RowAxis", "ColumnAxis", "OutputAxis1", "OutputAxis2", "SampDistRow",
-                 "SampDistCol", "NumCols"),
+                      "SampDistCol", "NumCols"),
 }
 POSITIONAL[TableKind.GALVO] = POSITIONAL[TableKind.TWO_D]
 

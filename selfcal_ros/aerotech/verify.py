@@ -146,9 +146,9 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
         rows.append((PLACES[residual.place], *fixed_column(sizes, 4), unit))
     header = ("error", "rms before", "after", "largest before", "after", "unit")
     figure = CaptionedFigure(controller_figure(found),
-                    "A simulated controller moves to the nodes and to the middle of every cell, "
-                    "without and with the exported table. What remains between the nodes is the "
-                    "controller's linear interpolation.")
+                             "A simulated controller moves to the nodes and to the middle of every "
+                             "cell, without and with the exported table. What remains between the "
+                             "nodes is the controller's linear interpolation.")
     leaves = Section("What the table leaves", table=(header, *rows), notes=(
         "The map is taken as the truth here: its own U adds to what remains.",))
     return Chapter(TITLE, (figure,), (leaves,))

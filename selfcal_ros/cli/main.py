@@ -52,10 +52,10 @@ def build_parser(only: str | None = None) -> "Parser":
     If it is not one, no verb is imported: their names and help are known without.
     """
     parser = AllVerbs(prog="selfcal", description="Calibrates XY-theta stages from readings of a "
-                   "plate in several views, and states the uncertainty of every number.",
-                   epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does not "
-                   "identify the stage, 4 no usable data, 5 written but not qualified, 1 internal "
-                   "error")
+                      "plate in several views, and states the uncertainty of every number.",
+                      epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does "
+                      "not identify the stage, 4 no usable data, 5 written but not qualified, 1 "
+                      "internal error")
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=Parser)
     for name in [only] if only in VERBS else VERBS:

@@ -312,9 +312,9 @@ MAP = "Map"
 
 def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
     """Return the error and its uncertainty, first together, then by component."""
-    vectors = CaptionedFigure(error_map(result, truth),
-                     "Each vector points from the true position of the stage to the indicated one.",
-                     on_screen="Point at a site to read its numbers.")
+    caption = "Each vector points from the true position of the stage to the indicated one."
+    vectors = CaptionedFigure(error_map(result, truth), caption,
+                              on_screen="Point at a site to read its numbers.")
     figures = [vectors, *_figures(
         (uncertainty_map(result), "How well each node is known: the larger U of x and y. Edges and "
                                   "corners are covered by fewer views. Unknown nodes are grey."),
