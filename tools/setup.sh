@@ -41,6 +41,14 @@ replaced() {  # the pins of tools/requirements.txt, those of $pins in place of t
     "$pins" tools/requirements.txt
 }
 
+install_pins() {  # by four pips at once: each spends half its time on the network, and has one core
+  rm -f "$build"/pins.*
+  replaced | split -n r/4 - "$build/pins."
+  printf '%s\n' "$build"/pins.* | xargs -P 4 -n 1 "$venv/bin/python" -m pip install -qq \
+    --disable-pip-version-check --no-deps --no-compile --require-hashes --only-binary :all: \
+    --no-binary "empy${SOURCES:+,$SOURCES}" -r
+}
+
 compile() {  # what is no Python 3, as templates, and what nothing imports is passed over
   "$venv/bin/python" -m compileall -q -j 0 -x '/(tests?|templates?|mypyc?|docutils)/' "$@" || true
 }
@@ -57,9 +65,7 @@ if ! fresh wheels "$wheels"; then
   fi
   include=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("include"))')
   [ -f "$include/Python.h" ] || die "Python.h is missing; install the headers, e.g. 'apt install python3.12-dev'"
-  replaced > "$build/requirements.txt"
-  step "installing the pinned wheels (about a minute)" "$venv/bin/python" -m pip install \
-    --disable-pip-version-check --no-deps --no-compile --require-hashes --only-binary :all: --no-binary "empy${SOURCES:+,$SOURCES}" -r "$build/requirements.txt"
+  step "installing the pinned wheels (about half a minute)" install_pins
   step "mending the wheels' CMake paths" "$venv/bin/python" tools/mend_wheels.py
   # here and on both cores: else every process that may not write bytecode compiles all it imports
   step "compiling them" compile "$venv/lib"
