@@ -17,7 +17,7 @@ demo: setup  ## replay a recorded bag through the live nodes, and show the map
 	@$(BIN)/python tools/demo.py
 lint: setup  ## style, types
 	@$(BIN)/ruff check .
-	@$(BIN)/mypy
+	@$(BIN)/mypy --num-workers $(shell nproc)
 build/linters/.complete: tools/linter-requirements.txt | setup
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade \
 		--target build/linters -r $< && touch $@ || echo "ament-lint: left out: its linters cannot be installed"
