@@ -326,7 +326,7 @@ class TermEquations:
 
         (2, sites) of the XY map, and (K,) of the angular one.
         """
-        x, y, lines = (np.einsum("sp,pq,sq->s", part, covariance, part, optimize=True)
+        x, y, lines = ((part @ covariance * part).sum(axis=1)
                        for part in (self.maps.real, self.maps.imag, self.turned))
         return np.stack([x, y]), lines
 
