@@ -66,7 +66,7 @@ PLAN = {
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
     "artifact.grid_size": "N, marks along x, 3 to 401; or [along x, along y]",
     "artifact.grid_pitch": "distance between neighbouring marks, m",
-    "artifact.angular_count": "K, angular lines, at least 3; 0 without lines",
+    "artifact.angular_count": "K, angular lines, at least 3; 0 or omitted without lines",
     "artifact.grid_size_y": "marks along y if the plate is not square; default: N",
     "views[].name": "name, unique",
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",

@@ -133,7 +133,7 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
         raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
     if raw["angular"] and not artifact.angular_count:
         raise InputError(where, "angular marks are wanted but the plate has none",
-                         "set angular to false")
+                         "set angular to false, or give the plate its angular_count")
     _check_degrees(raw["rotation_deg"], where)
     turn = math.radians(raw["rotation_deg"])
     if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines

@@ -86,7 +86,8 @@ def artifact_of(data: dict, where: str) -> Artifact:
         return Artifact(0, 0.0, raw["angular_count"], marks=marks_of(
             lists["id"], lists["x"], lists["y"]))
     raw = checked_fields(_with_sides(data, where), where, {
-        "grid_size": int, "grid_pitch": float, "angular_count": int}, {"grid_size_y": (int, 0)})
+        "grid_size": int, "grid_pitch": float}, {
+        "angular_count": (int, 0), "grid_size_y": (int, 0)})
     return Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"])
 
 

@@ -121,6 +121,12 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     assert not bare.views[0].angular
 
 
+def test_a_plate_without_angular_count_has_no_lines():
+    plate = {"grid_size": 5, "grid_pitch": 0.01}
+    assert plan_from_dict(plan_with(artifact=plate), "f") == plan_from_dict(
+        plan_with(artifact={**plate, "angular_count": 0}), "f")
+
+
 @pytest.mark.parametrize(("data", "message"), [
     (None, "f: not a mapping of keys to values; see the examples in config"),
     ({}, "f: the key 'plan_id' is missing; add it"),
@@ -136,8 +142,8 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
      "f: artifact: grid_size: 11.0 is not of type int"),
     (plan_with(artifact={"grid_size": True, "grid_pitch": 1, "angular_count": 0}),
      "f: artifact: grid_size: True is not of type int"),
-    (plan_with(artifact={"grid_size": 11, "grid_pitch": 1}),
-     "f: artifact: the key 'angular_count' is missing"),
+    (plan_with(artifact={"grid_size": 11, "angular_count": 0}),
+     "f: artifact: the key 'grid_pitch' is missing"),
     (plan_with({"rotation": 90}),
      "f: views[0]: rotation: unknown key; did you mean 'rotation_deg'? known are name, rotation_"),
     (plan_with({"rotation_deg": "90"}), "f: views[0]: rotation_deg: '90' is not of type float"),
@@ -170,7 +176,8 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     (plan_with({"grid": 1}), "f: views[0]: grid: 1 is not of type bool"),
     (plan_with({"grid": False, "angular": False}), "f: views[0]: neither grid nor angular marks"),
     ({**plan_with({"angular": True}), "artifact": {**PLAN["artifact"], "angular_count": 0}},
-     "f: views[0]: angular marks are wanted but the plate has none; set angular to false")])
+     "f: views[0]: angular marks are wanted but the plate has none; set angular to false, or "
+     "give the plate its angular_count")])
 def test_plans_that_are_refused(data, message):
     with pytest.raises(InputError) as caught:
         plan_from_dict(data, "f")
