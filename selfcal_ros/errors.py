@@ -145,5 +145,5 @@ def visible(text: str) -> str:
 def check_celsius(value: float, where: str, of: str = "") -> None:
     """Raise InputError for a temperature that no machine has in degC, as one given in kelvin."""
     if not -50.0 <= value <= 100.0:
-        raise InputError(where, f"{value:g}{of} is no temperature from -50 to 100 degC: is it in "
-                         "K?", "give degC")
+        raise InputError(where, f"{value:g}{of} is not a temperature from -50 to 100 degC: is it "
+                         "in K?", "give degC")

@@ -149,7 +149,7 @@ for _class in (*LOADERS, YamlDumper):
 
 
 class AsWritten(YamlLoader):
-    """Loader that keeps scalars as the text in the file: 01067 is no octal number, NO not false."""
+    """Loader that keeps scalars as the text in the file: 01067 is not octal, NO not false."""
 
 
 AsWritten.yaml_implicit_resolvers = {

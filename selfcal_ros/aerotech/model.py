@@ -330,7 +330,7 @@ def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
         data = data[len(codecs.BOM_UTF8):]
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
-        findings.stop(line, "a zero byte: this is no text file", "give a text file in UTF-8")
+        findings.stop(line, "a zero byte: this is not a text file", "give a text file in UTF-8")
     try:
         return _split(data.decode(), findings), set()
     except UnicodeDecodeError:

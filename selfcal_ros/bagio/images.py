@@ -121,7 +121,7 @@ def _stamp_ns(text: str, where: str) -> int:
     with suppress(ValueError):
         if (date := datetime.fromisoformat(text)).tzinfo is not None:
             return (date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-    raise InputError(where, f"'{text}' is no time with its zone",
+    raise InputError(where, f"'{text}' is not a time with its zone",
                      "write it as 2026-11-21T09:30:00.25+01:00")
 
 
@@ -259,7 +259,7 @@ class ImageBag:
     Raises
     ------
     InputError
-        If the path is no bag, or several namespaces have images.
+        If the path is not a bag, or several namespaces have images.
     NoDataError
         If there are no images.
     """

@@ -33,7 +33,7 @@ from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
 
 FAR_M = 1e9
-"""Distance beyond which a number is no place, whatever its unit."""
+"""Distance beyond which a number is not a place, whatever its unit."""
 A_ROW = 0.25
 """Detections of a row of the plate, as a part of those of the row with most of them."""
 LOOKED_AT = 2000

@@ -140,7 +140,7 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
                                       re.ASCII):
             tables[-1][2].extend(map(int, line.text.split()))
         else:
-            raise InputError(line.where, f"'{line.text[:60]}' is no part of a table",
+            raise InputError(line.where, f"'{line.text[:60]}' is not part of a table",
                              "export the tables again")
     grids = [_pmac_grid(*table) for table in tables]
     counts, motors = _counts(wiring), (wiring.frame.x_axis, wiring.frame.y_axis)

@@ -114,7 +114,7 @@ class Artifact:
             raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
                              "give the distance between marks in metres")
         if not PITCH_RANGE_M[0] <= self.grid_pitch_m <= PITCH_RANGE_M[1]:
-            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is no pitch of a "
+            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is not a pitch of a "
                              f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
                              f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'um'}? "
                              "give the distance between marks in metres")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The marks of a plate that is no lattice."""
+"""The marks of a plate that is not a lattice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ LEAST_DISTANCE_M = 1e-7
 
 @dataclass(frozen=True)
 class MarkList:
-    """Marks of a plate that is no lattice, in the order of their ids.
+    """Marks of a plate that is not a lattice, in the order of their ids.
 
     Attributes
     ----------

@@ -97,7 +97,7 @@ def _with_sides(data: dict, where: str) -> dict:
     if not isinstance(sides, list):
         return data
     if len(sides) != 2 or "grid_size_y" in data or not all(type(size) is int for size in sides):
-        raise InputError(f"{where}: grid_size", f"{sides!r} is no number of marks along x and y",
+        raise InputError(f"{where}: grid_size", f"{sides!r} is not a number of marks along x and y",
                          "give [8, 6], or grid_size and grid_size_y")
     return data | {"grid_size": sides[0], "grid_size_y": sides[1] if sides[1] != sides[0] else 0}
 

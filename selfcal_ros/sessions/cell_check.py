@@ -39,7 +39,7 @@ TURNED_DEG = 5.0
 """Turn of the offsets against the stage beyond which they are turned."""
 CLEARLY, LEAST_TURN_RAD = 0.1, 2e-4
 """Part of the plate's turn within which lines of the other sign show its opposite, and the least
-turn for which this is no chance."""
+turn for which this is not chance."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 REVISIT_S = 10.0

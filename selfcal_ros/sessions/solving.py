@@ -496,7 +496,7 @@ class SolvingSession:
 
 
 def _verdict(shown: Shown) -> dict[str, Any]:
-    """Return the fields of a verdict that map and summary share; without a map it is no good."""
+    """Return the fields of a verdict that map and summary share; without a map it is not good."""
     result = shown.result
     return {"qualified": result is not None and is_qualified(result),
             "run_id": shown.run.run_id,

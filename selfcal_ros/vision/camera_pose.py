@@ -130,7 +130,7 @@ def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: 
     mirror = bool(np.linalg.det(by_stage) < 0)
 
     def parts(matrix: np.ndarray) -> np.ndarray:
-        """Return size, turn, and the two parts that are no similarity, of m per px."""
+        """Return size, turn, and the two parts that are not a similarity, of m per px."""
         camera = sign * np.linalg.inv(matrix)
         if mirror:
             camera = camera * np.array([-1.0, 1.0])

@@ -21,7 +21,7 @@ ENCODINGS = {"mono8": ("u1", 1), "mono16": ("u2", 1), "rgb8": ("u1", 3), "bgr8":
 LARGEST = 1 << 26
 """Largest number of pixels of an image."""
 EXPANSION = 1000
-"""Largest number of pixels per byte of an encoded image: more is no picture of a camera."""
+"""Largest number of pixels per byte of an encoded image: more is not a picture of a camera."""
 FORMATS = ("PNG", "JPEG", "TIFF")
 """Formats that are decoded. Pillow starts programs for some others."""
 SAVE_AS = "give PNG, JPEG or TIFF: grey of 8 or 16 bits, or colour of 8"

@@ -218,7 +218,7 @@ BROKEN = [
      "a row has 999999999 columns of 2 values = 1999999998"),
     (STRICT_1D.replace("1.5", "1.5 °").encode("cp1252"), 5, "the line is not UTF-8"),
     (STRICT_1D.encode("utf-16"), 1, "the file is UTF-16"),
-    (b":START 1\n\0\0", 2, "a zero byte: this is no text file"),
+    (b":START 1\n\0\0", 2, "a zero byte: this is not a text file"),
     (ONE + STRICT_2D, 4, "a 2D table in a file of 1D tables"),
 ]
 

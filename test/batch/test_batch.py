@@ -41,7 +41,7 @@ from test.support.waiting import wait_until
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory):
-    """A folder with four good bags, one that lacks views, one that is no bag."""
+    """A folder with four good bags, one that lacks views, one that is not a bag."""
     folder = tmp_path_factory.mktemp("shelf")
     (folder / "deep" / "deeper").mkdir(parents=True)
     for seed, place in enumerate(("a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap")):

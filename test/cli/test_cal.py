@@ -344,7 +344,7 @@ def test_eval_counts(run, tmp_path):
     (["--position", "1=inf"], "'inf' is not a number"),
     (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
     (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),
-    (["--position", "1=1", "--temperature", "nan"], "is no temperature"),
+    (["--position", "1=1", "--temperature", "nan"], "is not a temperature"),
     (["--position", "1=1", "--temperature", "296"], "is it in K?")])
 def test_eval_without_sense(run, tmp_path, args, message):
     (tmp_path / "f.cal").write_text(CAL_1D)

@@ -297,7 +297,7 @@ def own_values(data):
     ("\ufefffile,view,x,y\r\na.png,,0,0\r\n", ":2: an empty cell"),
     ("file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n", ":4: a.png is in line 2 as well"),
     ("file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:00\n",
-     ":2: '2026-11-21T09:30:00' is no time with its zone; write it as 2026-11-21T09:30:00.25+01:0"),
+     ":2: '2026-11-21T09:30:00' is not a time with its zone; write it as 2026-11-21T09:30:00.25+0"),
     ("file,view,x,y,time\na.png,shift,0,0,\n", ":2: an empty cell; give file, view, x, y, time"),
     ("file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:01Z\n"
      "b.png,shift,0,0,2026-11-21T10:30:01.05+01:00\n",

@@ -141,7 +141,7 @@ def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():
      "file:7: row 1, column 2 is not in the table"),
     ("kmotion", "1,2\n1,1\n0,0", "file: 1 rows and 2 columns"),
     ("kmotion", "2,2\n1,0\n0,0", "file: 2 rows and 2 columns, spacing [1.0, 0.0]"),
-    ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is no part of a table"),
+    ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is not part of a table"),
     ("pmac", "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3", "file:1: motors (1, 3, 1) are not those"),
     ("pmac", "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2", "file:1: 2 entries for 1.1; 3 belong")])
 def test_a_reader_names_the_line_and_what_is_wrong(name, text, message):

@@ -85,7 +85,7 @@ IN_THE_MIDDLE = [
     ("no answer of the camera", "machine.image: TimeoutError: no answer in 5 s"),
     ("driver raises an error of its own", "machine.move_to: OSError: .*faults.py, line"),
     ("camera disconnected", "machine.image: OSError"),
-    ("position is no number", "its position is .*nan"),
+    ("position is not a number", "its position is .*nan"),
     ("position is infinite", "its position is .*inf"),
     ("position is None", "its position is None"),
     ("position is text", "its position is '1.0 mm'"),
@@ -187,7 +187,7 @@ def test_a_sensor_that_turns_its_sign_is_named_at_the_end_of_the_view(tmp_path):
 
 def test_an_offset_that_is_no_number_stops_the_stage(tmp_path):
     cell, machine = write_cell(tmp_path)
-    spoilt = Spoilt(machine, "offset is no number", ONSET)
+    spoilt = Spoilt(machine, "offset is not a number", ONSET)
     with pytest.raises(MachineError, match=r"an offset is x nan.*leave out what is not seen"):
         run_of(tmp_path, spoilt, cell).measure()
     assert spoilt.stops

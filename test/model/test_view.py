@@ -82,9 +82,9 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
     ((11, 0.01, 0, 2), "artifact grid_size_y: 2 is not"),
     ((11, 0.0), "artifact grid_pitch: 0.0 m is not a length"),
     ((11, -0.01), "artifact grid_pitch: -0.01 m is not a length"),
-    ((11, 10.0), "artifact grid_pitch: 10 m is no pitch of a plate (1e-07 to 1 m); is it in mm? "
+    ((11, 10.0), "artifact grid_pitch: 10 m is not a pitch of a plate (1e-07 to 1 m); is it in mm? "
      "give the distance between marks in metres"),
-    ((11, 9.9e-8), "artifact grid_pitch: 9.9e-08 m is no pitch of a plate"),
+    ((11, 9.9e-8), "artifact grid_pitch: 9.9e-08 m is not a pitch of a plate"),
     ((11, math.nan), "artifact grid_pitch: nan m is not a length"),
     ((11, math.inf), "artifact grid_pitch: inf m is not a length"),
     ((11, 0.01, 2), "artifact angular_count: 2 is not a number from 3 to "),

@@ -447,7 +447,7 @@ def changed(value, *path):
     (changed("warm", "conditions", 0, "value"), r"conditions\[0\].value: 'warm' is not a number"),
     (changed("degF", "conditions", 0, "unit"), "'degF' is not one of degC"),
     (changed(293.55, "conditions", 0, "value"),
-     r"conditions\[0\]: 293.55 is no temperature from -50 to 100 degC: is it in K\?; give degC"),
+     r"conditions\[0\]: 293.55 is not a temperature from -50 to 100 degC: is it in K\?; give degC"),
     (without("conditions", 0, "unit"), r"conditions\[0\]: neither a value with its unit nor"),
     (changed(0, "conditions", 0, "u"), r"conditions\[0\]: neither a value"),
     (changed("  ", "item", "name"), "item.name: '  ' is not a text"),

@@ -61,7 +61,7 @@ def _other_order(spoilt, at):
 POSITIONS: dict[str, Callable] = {
     "no answer for the position": _timed_out,
     "connection lost at a reading": _lost,
-    "position is no number": lambda _, at: _with(at, 1, math.nan),
+    "position is not a number": lambda _, at: _with(at, 1, math.nan),
     "position is infinite": lambda _, at: _with(at, 0, math.inf),
     "position is None": lambda _, at: None,
     "position lacks an axis": lambda _, at: at[:2],
@@ -184,7 +184,7 @@ IMAGES: dict[str, Callable] = {
 
 OFFSETS: dict[str, Callable] = {
     "offsets in um": lambda item: replace(item, x=item.x * 1e6, y=item.y * 1e6),
-    "offset is no number": lambda item: replace(item, x=math.nan),
+    "offset is not a number": lambda item: replace(item, x=math.nan),
     "offsets are reversed": lambda item: replace(item, x=-item.x, y=-item.y),
     "offsets are exchanged": lambda item: replace(item, x=item.y, y=item.x),
     "m and n are exchanged": lambda item: replace(item, mark=item.mark and item.mark[::-1]),

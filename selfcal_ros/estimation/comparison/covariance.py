@@ -6,7 +6,7 @@ variances of the map are known.
 
 The joint covariance of the maps of stage and plate is exact for noise and terms of the model. What
 else enlarges u (unequal noise, noise in time, stages read beside the sites) enlarges both maps in
-the ratio in which it enlarges that of the stage; effects that are no terms enlarge the plate's by
+the ratio in which it enlarges that of the stage; effects that are not terms enlarge the plate's by
 as much as the stage's, at every mark by itself.
 """
 

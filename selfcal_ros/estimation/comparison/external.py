@@ -92,8 +92,8 @@ def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:
     steps = np.array([row.cells["x"], row.cells["y"]]) / artifact.grid_pitch_m + artifact.half
     at = np.rint(steps)
     if np.abs(steps - at).max() > OFF_SITE or (at < 0).any() or (at >= artifact.shape).any():
-        raise InputError(row.place, f"({row.cells['x']:g}, {row.cells['y']:g}) m is no site of the "
-                         "other maps", "give the errors at their sites")
+        raise InputError(row.place, f"({row.cells['x']:g}, {row.cells['y']:g}) m is not a site of "
+                         "the other maps", "give the errors at their sites")
     return tuple(at.astype(int).tolist())
 
 

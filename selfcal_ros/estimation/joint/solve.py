@@ -214,7 +214,7 @@ both times the longer half width of the plate. The first `with_map` belong to th
 map, the others leave the map as it is."""
 
 OF_PLATE = "effects_on_plate"
-"""Key of what effects that are no terms of the model add to the variance of the plate's map for
+"""Key of what effects that are not terms of the model add to the variance of the plate's map for
 unit noise, (2, nx, ny)."""
 
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")

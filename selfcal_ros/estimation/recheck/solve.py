@@ -204,7 +204,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
 
 
 def _findings(found: Recheck) -> tuple[Finding, ...]:
-    """Return what has changed: the map, and the scale that is no part of it."""
+    """Return what has changed: the map, and the scale that is not part of it."""
     largest, scale, of = found.largest, found.scale, {"of": found.of}
     where = {"x": largest.x, "y": largest.y, **of}
     out: tuple[Finding, ...] = ()

@@ -733,7 +733,7 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Lo
 
 
 _OTHERS: dict[str, Callable[..., Located]] = {SLIP: _slip, READING: _reading}
-"""What is no term: see `selfcal_ros.blocks.Block.located`."""
+"""What is not a term: see `selfcal_ros.blocks.Block.located`."""
 
 
 def turned_too_far(model: ModelFit, result: CalibrationResult,

@@ -334,7 +334,7 @@ def _left_out_findings(measurements: Measurements) -> list[Finding]:
 
 
 FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
-"""Stamp below which stamps are no dates, 1971."""
+"""Stamp below which stamps are not dates, 1971."""
 
 
 def provenance_of(measurements: Measurements, options: Options) -> Provenance:

@@ -37,7 +37,7 @@ def dof_text(dof: float) -> str:
 
 
 def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
-    """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are no views.
+    """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are not views.
 
     Of the views in which a cell is one `of` those meant.
     """

@@ -191,7 +191,7 @@ def test_terms_with_sizes_are_part_of_the_noise():
     strained = recheck(after, replace(linear(), terms=parse_terms([f"plate_strain:{size}"], "")),
                        plate)
     x, y = plain.artifact.x_m, plain.artifact.y_m
-    both = np.hypot(x, y) * size  # stretch and shear; a scale is no part of the map
+    both = np.hypot(x, y) * size  # stretch and shear; a scale is not part of the map
     for name in ("u_gx", "u_gy"):
         u, more = (getattr(result.error_map, name) for result in (plain, strained))
         assert more == pytest.approx(np.hypot(u, both), rel=1e-6)
