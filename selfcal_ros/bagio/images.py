@@ -20,7 +20,7 @@ from selfcal_ros.bagio.schemas import store_with
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.errors import InputError, NoDataError, known_are
-from selfcal_ros.files import csv_cells, read_bytes, read_text
+from selfcal_ros.files import csv_cells, number_of, read_bytes, read_text
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.view import Plan
@@ -137,7 +137,7 @@ def _check_unit(path: str, rows: list[Position], plan: Plan) -> None:
 
 def _metres(text: str, where: str) -> float:
     try:
-        value = float(text)
+        value = number_of(text)
     except ValueError:
         value = math.nan
     if not abs(value) <= FARTHEST_M:

@@ -11,7 +11,7 @@ from selfcal_ros.cli.deliver import deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import csv_cells, read_text
+from selfcal_ros.files import csv_cells, number_of, read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.units import MM_PER_M, UM_PER_M
@@ -125,7 +125,7 @@ def read_points(text: str, where: str) -> np.ndarray:
     points = np.empty((len(rows) - 1, len(head)))
     for index, (number, cells) in enumerate(rows[1:]):
         try:
-            points[index] = list(map(float, cells)) if len(cells) == len(head) else np.nan
+            points[index] = list(map(number_of, cells)) if len(cells) == len(head) else np.nan
         except ValueError:
             points[index] = np.nan
         if not np.abs(points[index]).max() < 1e12:

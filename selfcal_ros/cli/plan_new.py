@@ -31,7 +31,7 @@ from selfcal_ros.estimation.observability.suggest import (
     score_plan,
 )
 from selfcal_ros.estimation.terms.planned import Assumed
-from selfcal_ros.files import write_yaml
+from selfcal_ros.files import number_of, write_yaml
 from selfcal_ros.machine.cell import PLACERS, SHIPPED
 from selfcal_ros.machine.visiting import stops
 from selfcal_ros.model.artifact import Artifact
@@ -122,7 +122,7 @@ def _count(text: str, option: str) -> int:
 
 def _positive(text: str, option: str) -> float:
     try:
-        value = float(text)
+        value = number_of(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.files import csv_cells, read_text
+from selfcal_ros.files import csv_cells, number_of, read_text
 from selfcal_ros.laser import data as laser_data
 from selfcal_ros.laser.profiles import name_of
 from selfcal_ros.outputs import write_text
@@ -149,15 +149,14 @@ def _block(text: str, where: str) -> int:
 
 def _number(text: str, where: str) -> float:
     try:
-        # float() also accepts 1_000 and digits of other scripts
-        number = float(text if text.isascii() and "_" not in text else "other")
+        value = number_of(text)
     except ValueError as error:
         raise InputError(where, f"'{text}' is not a number" if text else "the cell is empty",
                          "give a number in mm") from error
-    if not math.isfinite(number):
+    if not math.isfinite(value):
         raise InputError(where, f"'{text}' is not a finite number",
                          "measure the block again or leave its row out of the repeats")
-    return number
+    return value
 
 
 def _values(named: dict[str, str], columns: RequiredColumns,

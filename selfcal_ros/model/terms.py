@@ -8,7 +8,7 @@ from functools import cache
 
 from selfcal_ros.blocks import Block, block_of, blocks
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.files import checked_fields
+from selfcal_ros.files import checked_fields, number_of
 
 MAX_DRIFT_DEGREE = 9
 """Largest degree of the polynomial of a view's drift."""
@@ -183,7 +183,7 @@ def _term(name: str, texts: list[str], where: str) -> ModelTerm:
 def parse_size(text: str, where: str) -> float:
     """Return a size written in SI units, or 0."""
     try:
-        size = float(text)
+        size = number_of(text)
     except ValueError:
         size = math.nan
     if not 0 <= size < math.inf:

@@ -111,7 +111,8 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     ("x,y\n", "p.csv: it has no points"),
     ("x,y\n1,2,3\n", "p.csv:2: not 2 positions; give x,y in m and rad"),
     ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"), ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
-    ("x,y\n1,z\n", "p.csv:2: not 2 positions")])
+    ("x,y\n1,z\n", "p.csv:2: not 2 positions"),
+    ("x,y\n1,1_0e-3\n", "p.csv:2: not 2 positions"), ("x,y\n1,٠.٠١\n", "p.csv:2: not 2 positions")])
 def test_a_bad_table_is_one_line(desk, capsys, text, message):
     (desk / "p.csv").write_text(text)
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 2

@@ -56,6 +56,8 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
     ("", r"marks.csv:1: no column id, x, y"),
     (GOOD + "6,0.01\n", r"marks.csv:7: 2 cells, not 3; correct the line"),
     (GOOD + "6,a,0\n", r"marks.csv:7: x 'a' is not a number"),
+    (GOOD + "6,0.0_1,0\n", r"marks.csv:7: x '0.0_1' is not a number"),
+    (GOOD + "1_0,0,0\n", r"marks.csv:7: id '1_0' is not a whole number"),
     (GOOD + "b,0,0\n", r"marks.csv:7: id 'b' is not a whole number"),
     (GOOD + "1.0,0,0\n", r"marks.csv:7: id '1.0' is not a whole number"),
     (GOOD + "3,0.02,0\n", r"marks.csv:7: the id 3 is used already in .*marks.csv:4"),

@@ -40,6 +40,7 @@ def test_a_microscope_has_three_sizes():
 @pytest.mark.parametrize(("text", "said"), [
     ("drift:1e-8:1e-8:1e-8", "--model: drift: 3 sizes are given; give one"),
     ("microscope:0.1:0.1", "--model: microscope: 2 sizes are given; give one, or"),
+    ("drift:1_0e-9", "--model: drift: the size '1_0e-9' is not a positive number"),
     ("microscope:0.1:x:0.1", "--model: microscope: the size 'x' is not a positive number"),
     ("microscope:0.1:0.1:2", "--model: microscope: the size 2 is outside 1e-18 to 1")])
 def test_sizes_that_no_term_has(text, said):

@@ -7,7 +7,7 @@ from typing import Any
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
-from selfcal_ros.files import csv_cells, read_text, read_yaml
+from selfcal_ros.files import csv_cells, number_of, read_text, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
@@ -89,7 +89,8 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
         for name, values in columns.items():
             cell = cells[head.index(name)]
             try:
-                values.append(int(cell) if name == "id" else float(cell))
+                value = number_of(cell)
+                values.append(int(cell) if name == "id" else value)
             except ValueError:
                 raise InputError(place, f"{name} '{cell}' is not a {_KIND[name]}",
                                  "correct the line") from None

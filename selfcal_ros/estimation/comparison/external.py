@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import csv_cells
+from selfcal_ros.files import csv_cells, number_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
 
@@ -78,7 +78,7 @@ def _rows(text: str, where: str) -> list[_Row]:
         if len(cells) != len(head):
             raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
         try:
-            values = {name: float(cell) if cell else np.nan
+            values = {name: number_of(cell) if cell else np.nan
                       for name, cell in zip(head, cells, strict=True) if name in (*XY, *THETA)}
         except ValueError:
             raise InputError(place, "a cell is not a number", "correct the line") from None
