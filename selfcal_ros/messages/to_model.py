@@ -372,6 +372,11 @@ class PositionEditor:
         found = self._known[0]
         return found.names, found.form.unpack_from(data, found.at)
 
+    @property
+    def frame_id(self) -> str:
+        """The frame in the header of the last message read."""
+        return self._known[0].frame_id
+
     def replaced(self, data: bytes, positions: Sequence[float]) -> bytes:
         """Return the last message read with other positions."""
         found = self._known[0]
@@ -391,7 +396,7 @@ class PositionEditor:
         mask = int.from_bytes(layout.fixed)
         self._known.appendleft(_Positions(
             len(data), mask, int.from_bytes(data) & mask, layout.texts["name"],
-            Struct(f"{code[0]}{count}d"), at))
+            layout.texts["header.frame_id"][0], Struct(f"{code[0]}{count}d"), at))
         return True
 
 
@@ -402,6 +407,7 @@ class _Positions(NamedTuple):
     mask: int
     value: int
     names: tuple[str, ...]
+    frame_id: str
     form: Struct
     at: int
 

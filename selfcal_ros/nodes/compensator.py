@@ -33,7 +33,8 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         self.session = CompensatingSession(self.settings, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
         self._commands = self.publisher(names.CORRECTED_MOTION)
-        self.alone_on += [names.CORRECTED.name, names.CORRECTED_MOTION.name]
+        self.alone_on += [names.ERROR_MAP.name, names.SUMMARY.name, names.CORRECTED.name,
+                          names.CORRECTED_MOTION.name]
 
     def activate(self) -> None:
         """Subscribe to the maps and to the encoder."""

@@ -57,6 +57,7 @@ class CompensatingSession:
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
         self._skipped = self._commands_refused = self._outside = 0  # since then
         self._strange: tuple[str, ...] = ()  # joints of the last sample without one of the stage
+        self._other_frame = ""  # of the last command that names another than the stage's
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = ""
@@ -95,11 +96,21 @@ class CompensatingSession:
         if not waits:
             message, self._map = self._map, None
             try:
+                self._refuse_other_frame(message)
                 self._use(to_model.error_map(message), _source(message),
                           to_model.stamp_ns(message), str(getattr(message, "interpolation", "")))
             except InputError as error:
                 self._waits = str(error)
                 raise
+
+    def _refuse_other_frame(self, message: Any) -> None:
+        """Refuse a map of another frame than the positions'; an empty one is not stated."""
+        frame, own = message.header.frame_id, self._settings.frame_id
+        if frame not in ("", own):
+            raise InputError(f"the map of {_source(message)}", f"it is in the frame "
+                             f"{printable(frame)!r}, the positions to correct are in {own!r}",
+                             "use a map of this stage, or set frame_id of the compensator and of "
+                             "the solver alike")
 
     def _doubt(self) -> str:
         """Return why the newest map must not be used, or ""."""
@@ -216,6 +227,8 @@ class CompensatingSession:
             self.counts["commands_refused"] += 1
             self._commands_refused += 1
             return None
+        if self._editor.frame_id not in ("", self._settings.frame_id):
+            self._other_frame = self._editor.frame_id
         self.counts["commands"] += 1
         return self._editor.replaced(data, corrected)
 
@@ -321,6 +334,11 @@ class CompensatingSession:
                              self._settings.joint_theta))
             lines.append(f"joints {printable(', '.join(strange))} are not of the stage ({own}): "
                          "correct joint_x, joint_y and joint_theta, or the publisher")
+        frame, self._other_frame = self._other_frame, ""
+        if frame:
+            lines.append(f"commands name the frame {printable(frame)!r}, but are corrected as "
+                         f"positions in {self._settings.frame_id!r}: transform them first, or set "
+                         "frame_id if it is the stage's")
         outside, self._outside = self._outside, 0
         if outside:
             lines.append(f"{outside} positions outside the field since the last status, corrected "

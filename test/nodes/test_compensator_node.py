@@ -194,6 +194,18 @@ def test_without_a_map_the_state_is_a_warning(graph):
     assert (status.level, status.message) == (b"\x01", "no error map yet")
 
 
+@pytest.mark.usefixtures("quick_beat")
+def test_a_second_publisher_of_maps_is_named(graph):
+    graph.node(CompensatorNode)
+    said: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    for _ in range(2):
+        latch_map(graph)
+    line = "selfcal/error_map has 2 publishers: /hand, /hand; only one is allowed"
+    graph.until(lambda: said and line in said[-1].status[0].message, "the warning")
+    assert said[-1].status[0].level == b"\x01"
+
+
 def test_a_malformed_map_does_not_end_the_node(graph):
     node = graph.node(CompensatorNode)
     publisher = graph.publisher(names.ERROR_MAP)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of the compensator: which map is used, since when, and why another is not."""
 
+import contextlib
 import json
 import math
 from collections.abc import Sequence
@@ -62,10 +63,10 @@ def use(desk, error_map=ONE) -> Compensator:
     return Compensator(error_map)
 
 
-def commanded(desk, names, position) -> list[float] | None:
+def commanded(desk, names, position, frame_id: str = "stage") -> list[float] | None:
     """Send a command through the session; return the positions that it passes on."""
     message = build(typestore(), "sensor_msgs/msg/JointState", {
-        "header": from_model.header(5, "stage"), "name": list(names), "effort": [],
+        "header": from_model.header(5, frame_id), "name": list(names), "effort": [],
         "position": list(position), "velocity": [0.5] * len(names)})
     data = bytes(typestore().serialize_cdr(message, "sensor_msgs/msg/JointState"))
     out = desk.session.command(data)
@@ -112,6 +113,17 @@ def test_joints_that_are_not_of_the_stage_are_named(desk):
         "joints gantry_x, gantry_y are not of the stage (x, y, theta)") in told.message
     assert desk.session.counts["refused"] == 2 and desk.session.counts["corrected"] == 0
     assert desk.session.diagnosis().level == Level.OK  # told once
+
+
+@pytest.mark.parametrize("frame_id, said", [("stage", False), ("", False), ("gantry", True)])
+def test_a_command_in_another_frame_is_named_once(desk, frame_id, said):
+    use(desk)
+    assert commanded(desk, NAMES, [0.0, 0.0, 0.0], frame_id) is not None
+    told = desk.session.diagnosis()
+    assert told.level == (Level.WARN if said else Level.OK)
+    assert ("commands name the frame 'gantry', but are corrected as positions in 'stage'"
+            in told.message) is said
+    assert desk.session.diagnosis().level == Level.OK
 
 
 def test_no_command_passes_without_a_map(desk):
@@ -309,6 +321,19 @@ def test_a_map_that_harms_leaves_the_former_one_in_use(desk, changes, why):
     assert why in desk.session.diagnosis().message
     desk.session.take_map(map_of(ONE, START_NS + 1))
     assert desk.session.correct(NAMES, [0.01, -0.01, 0.3]) != before
+
+
+@pytest.mark.parametrize("frame_id, used", [("stage", True), ("", True), ("gantry", False)])
+def test_a_map_of_another_frame_leaves_the_former_one_in_use(desk, frame_id, used):
+    use(desk, TWO)
+    before = desk.x_at(0.01)
+    desk.session.take_summary(summary_of(START_NS + 1))
+    newer = map_of(ONE, START_NS + 1, header=from_model.header(START_NS + 1, frame_id))
+    why = "it is in the frame 'gantry', the positions to correct are in 'stage'"
+    with contextlib.nullcontext() if used else pytest.raises(InputError, match=why):
+        desk.session.take_map(newer)
+    assert (desk.x_at(0.01) != before) is used
+    assert (why in desk.session.diagnosis().message) is not used
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])

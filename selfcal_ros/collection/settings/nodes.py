@@ -201,7 +201,8 @@ class CompensatorSettings(ManagedSettings):
     """Which map compensator uses, and how."""
 
     NODE: ClassVar[str] = "compensator"
-    frame_id: str = _frame()
+    frame_id: str = declared("stage", "frame of the positions to correct; a map that states "
+                             "another one is not used")
     joint_x: str = declared("x", "name of the joint that indicates x")
     joint_y: str = declared("y", "name of the joint that indicates y")
     joint_theta: str = declared("theta", "name of the joint that indicates theta")
