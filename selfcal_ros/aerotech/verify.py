@@ -22,6 +22,10 @@ from selfcal_ros.reporting.summary.numbers import fixed_column, significant
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
 
+LEFT_OF_A_MAP = 0.05
+"""Part of the error that a table of the same map may leave: far more than the rounding of its
+digits, and than the error of a stage changes over the shift by the zero bias."""
+
 
 def setup_of(frame: MachineFrame) -> MachineSetup:
     """Return the controller's settings for the axes of a frame."""
@@ -52,12 +56,16 @@ def turned(stage: Compensator, frame: MachineFrame, theta_rad: ArrayLike,
 
 @dataclass(frozen=True, eq=False)
 class TableVerification:
-    """Residuals at the sites, between them, and at the angular lines; None if not requested."""
+    """Residuals at the sites, between them, and at the angular lines; None if not requested.
+
+    `in_two_axes` states whether one of the tables is 2D: 1D ones correct only part of a map.
+    """
 
     frame: MachineFrame
     sites: Residual | None = None
     between: Residual | None = None
     lines: Residual | None = None
+    in_two_axes: bool = False
 
     @property
     def residuals(self) -> list[Residual]:
@@ -69,6 +77,24 @@ class TableVerification:
         """Whether the tables make the machine worse at its sites or lines."""
         return any(r.rms("after") > (1 + 1e-6) * r.rms("before")
                    for r in (self.sites, self.lines) if r is not None)
+
+    def unfit(self, error_map: ErrorMap) -> list[Residual]:
+        """Return the residuals of tables that are not those of a map, though no worse than none.
+
+        Of a 2D table and of a theta table no more than U of the map (k = 2) may remain, or
+        `LEFT_OF_A_MAP` of its error.
+        """
+        pairs = ((self.sites if self.in_two_axes else None, (error_map.u_gx, error_map.u_gy)),
+                 (self.lines, (error_map.u_g_theta,)))
+        return [residual for residual, u in pairs if residual is not None and residual.rms("after")
+                > max(LEFT_OF_A_MAP * residual.rms("before"), 2 * _rms_of(u))]
+
+
+def _rms_of(u: Sequence[np.ndarray]) -> float:
+    """Return the root mean square of the vectors of u where it is known, else 0."""
+    squares = np.sum(np.square(u), axis=0)
+    known = squares[np.isfinite(squares)]
+    return float(np.sqrt(known.mean())) if known.size else 0.0
 
 
 def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
@@ -98,7 +124,8 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
         between = rest[0] if rest else None
     if theta:
         lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
-    return TableVerification(frame, sites, between, lines)
+    return TableVerification(frame, sites, between, lines,
+                             in_two_axes=any(isinstance(table, Table2D) for table in xy))
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:

@@ -300,7 +300,13 @@ def _verify(args: argparse.Namespace) -> int:
     if found.worse:
         raise InputError(cal.where, "the tables make the machine worse",
                          "check signs, axes, unit, home position and encoder directions")
-    return int(ExitCode.DONE)
+    unfit = found.unfit(result.error_map)
+    for residual in unfit:
+        print(f"{args.leaf.prog}: {cal.where}: the tables leave "
+              f"{residual.rms('after') / residual.rms('before'):.0%} of the error at the "
+              f"{residual.place}, more than the U of the map: they are not those of this map; "
+              "check offset, unit and number of rows, or export them again", file=sys.stderr)
+    return int(ExitCode.NOT_QUALIFIED if unfit else ExitCode.DONE)
 
 
 def figures_of(residuals: "list[Residual]") -> dict:

@@ -119,6 +119,37 @@ def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
     one_line(err, "bad.cal: the tables make the machine worse; check signs")
 
 
+def without_last_row(text: str) -> str:
+    *rows, _, end = text.splitlines(keepends=True)
+    return "".join([*rows, end])
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda text: text.replace("CORUNIT=PRIMARY/1000", "CORUNIT=PRIMARY/1000000"),
+    lambda text: text.replace("OFFSETROW=30", "OFFSETROW=35"),
+    lambda text: text.replace("=30\n", "=-30\n"), without_last_row])
+def test_a_table_that_is_not_that_of_the_map_does_not_pass(run, tmp_path, spoil):
+    """None of these makes the machine worse."""
+    run("export", "r.json", "-o", "f.cal")
+    right = (tmp_path / "f.cal").read_text()
+    (tmp_path / "bad.cal").write_text(spoil(right))
+    assert spoil(right) != right and run("check", "bad.cal")[0] == 0
+    code, out, err = run("verify", "r.json", "bad.cal")
+    assert code == 5 and "49 sites" in out
+    one_line(err, "bad.cal: the tables leave ", "% of the error at the sites",
+             "they are not those of this map; check offset, unit")
+
+
+def test_a_theta_table_that_does_nothing_does_not_pass(run, tmp_path):
+    run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
+    right = (tmp_path / "f_theta.cal").read_text()
+    (tmp_path / "bad.cal").write_text(right.replace("PRIMARY/3600", "PRIMARY/3600000"))
+    assert run("verify", "r.json", "f_theta.cal")[0] == 0
+    code, _, err = run("verify", "r.json", "bad.cal")
+    assert code == 5
+    one_line(err, "bad.cal: the tables leave 100% of the error at the lines")
+
+
 def test_theta_goes_into_a_file_of_its_own(run):
     code, out, err = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
     assert code == 0 and out.splitlines()[:2] == ["f.cal: 2D table for x and y",
