@@ -27,7 +27,6 @@ from selfcal_ros.estimation.joint.camera import (
     straightened,
     yaw_of,
 )
-from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -235,7 +234,7 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
     """Return readings of a known plate corrected by the camera of its calibration."""
     if not measurements.has_images:
         return measurements
-    if IMAGES not in plate.result.extra:
+    if plate.result.kept.images is None:
         raise InputError(plate.where, "its noise is not separated into that of images and that of "
                          "marks, but the readings have images of several marks",
                          "recheck with one mark an image, or calibrate with such images")

@@ -23,6 +23,7 @@ from selfcal_ros.model.camera import (
     shown_by_images,
 )
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.kept import KEYS, Kept, kept_from_dict
 from selfcal_ros.model.plate_form import (
     artifact_of,
     artifact_to_dict,
@@ -202,6 +203,7 @@ class CalibrationResult:
     method: str = "joint"
     sense: str = "microscope_moves"
     extra: dict[str, Any] = field(default_factory=dict)
+    kept: Kept = Kept()
     verdict: Verdict = Verdict(Grade.GOOD)
     model: ModelResult = ModelResult()
     reference: dict[str, Any] | None = None
@@ -324,6 +326,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "input": dict(result.input),
         **({} if result.recheck is None else {"recheck": result.recheck.to_dict()}),
         **({"camera": shown} if (shown := camera_to_dict(result.camera, result.stage_yaw)) else {}),
+        **result.kept.to_dict(),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -381,7 +384,7 @@ _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
 _KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
           "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
           "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "excluded", "input", "map", "recheck", "camera", DIGEST}
+          "budget", "excluded", "input", "map", "recheck", "camera", DIGEST, *KEYS}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -432,6 +435,7 @@ def _parse(data: dict) -> CalibrationResult:
         method=read(str, data.get("method", "joint")),
         sense=read(str, data.get("measurement_sense", "microscope_moves")),
         extra={key: value for key, value in data.items() if key not in _KNOWN},
+        kept=kept_from_dict(data, artifact.field.shape, artifact.shape, artifact.angular_count),
         verdict=verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
         model=read(ModelResult, data.get("model") or {}),
         reference=reference_from_dict(data.get("reference")),

@@ -32,7 +32,7 @@ from selfcal_ros.estimation.comparison.maps import (
 )
 from selfcal_ros.estimation.datum.covariance import NO_NOISE, USUAL_LEVEL
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, coverage_factor
-from selfcal_ros.estimation.joint.solve import KEY, factors_of
+from selfcal_ros.estimation.joint.solve import factors_of
 from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import TRACE
@@ -657,8 +657,8 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
     terms = {term.name: term for term in result.model.terms}
     names = [name for name, block in blocks().items() if block.shared
              if name in terms and remaining_part(terms[name]) >= TOLD]
-    of_terms = result.extra[KEY]["terms"] if KEY in result.extra else []
-    factors = factors_of(result)[np.isin(of_terms, names)][:, :, known]
+    kept = factors_of(result)
+    factors = kept.of_map[np.isin(kept.terms, names)][:, :, known]
     factors = factors.reshape(len(factors), 2 * int(known.sum()))
     factors = factors * np.nan_to_num(result.noise.sigma_xy)
     if keep_scale and result.reference is not None:

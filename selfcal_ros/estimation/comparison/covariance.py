@@ -10,38 +10,30 @@ the ratio in which it enlarges that of the stage; effects that are not terms enl
 as much as the stage's, at every mark by itself.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.datum.covariance import (
     LinesCovariance,
     MapsCovariance,
     conditions_for,
     lines_alone,
 )
-from selfcal_ros.estimation.joint.images import IMAGES, ImageNoise, stops_of
-from selfcal_ros.estimation.joint.noise_effects import ADDED
+from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
 from selfcal_ros.estimation.joint.problem import bounded_ratio
-from selfcal_ros.estimation.joint.solve import (
-    BESIDE,
-    KEY,
-    OF_PLATE,
-    factors_of,
-    kept_numbers,
-    not_kept,
-    rounded,
-)
+from selfcal_ros.estimation.joint.solve import factors_of, rounded
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.kept import Factors, ImagesKept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import block_of_offsets
@@ -119,7 +111,7 @@ def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarr
     values = result.error_map.of(kind)[0]
     there = np.isfinite(values).all(axis=0)
     n = len(values) * int(there.sum())
-    lower, scale = (kept_numbers(result.extra[COVARIANCE], name, shape, COVARIANCE,
+    lower, scale = (_kept_numbers(result.extra[COVARIANCE], name, shape, COVARIANCE,
                                  "no covariance of this map", verb="combine")
                     for name, shape in ((kind, (n * (n + 1) // 2,)), (f"scale_{kind}", ())))
     full = np.zeros((n, n))
@@ -156,11 +148,11 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         if found is None or found.lacks_terms:
             return unknown
         shear = found.system.gauge.shear
-        moved = np.real(np.tensordot(_complex(factors_of(result)), turned_over(
+        moved = np.real(np.tensordot(_complex(factors_of(result).of_map), turned_over(
             result.sense, shear).conj(), axes=((1, 2), (1, 2))))
-        added = kept_numbers({ADDED: (0.0, 0.0)} | result.extra, ADDED, (2,), ADDED,
-                             "not two variances")
-        variance = np.diag(found.maps.of(shear)) + (moved**2).sum(axis=0) + added
+        added = result.kept.added
+        variance = np.diag(found.maps.of(shear)) + (moved**2).sum(axis=0) + (
+            0.0 if added is None else added)
         variance = variance * (result.noise.sigma_xy / found.half_width_m) ** 2
     o, r = np.sqrt(variance)
     return float(o), float(r)
@@ -204,38 +196,27 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
 
 def share_of(result: CalibrationResult) -> float:
     """Return the part of the variance of a reading that the marks of an image share; 0 without."""
-    return _of_images(result, "share", 1.0)
+    return 0.0 if result.kept.images is None else result.kept.images.share
 
 
 def dof_of_marks(result: CalibrationResult) -> float:
     """Return the degrees of freedom of the noise of a mark by itself; 0 without images."""
-    return _of_images(result, "dof_mark", math.inf)
-
-
-def _of_images(result: CalibrationResult, name: str, most: float) -> float:
-    """Return a number from 0 to `most` that a result of images keeps; 0 without images."""
-    wrong = "no noise of images"
-    found = kept_numbers(result.extra.get(IMAGES, {name: 0.0}), name, (), IMAGES, wrong,
-                         finite=False)
-    if not 0 <= found <= most:
-        raise not_kept(IMAGES, wrong)
-    return float(found)
+    return 0.0 if result.kept.images is None else result.kept.images.dof_mark
 
 
 def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
     """Return the first of the grid views that have the rotation of each, see `rotations_of`."""
-    if IMAGES not in result.extra:
+    if result.kept.images is None:
         return tuple(range(n_views))
-    placings, steps = zip(*_kept_cells(result, n_views), strict=True)
+    placings, steps = zip(*_kept_cells(result.kept.images, n_views), strict=True)
     return shared_rotations([placings.index(number) for number in placings], steps)
 
 
-def _kept_cells(result: CalibrationResult, n_views: int) -> list[tuple[int, tuple[int, int]]]:
+def _kept_cells(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
-    placings, steps = (kept_numbers(result.extra[IMAGES], name, (n_views, *more), IMAGES,
-                                    "no images of these views").astype(int).tolist()
-                       for name, more in (("placing", ()), ("step", (2,))))
-    return [(number, (m, n)) for number, (m, n) in zip(placings, steps, strict=True)]
+    if not len(images.placing) == len(images.step) == n_views:
+        raise _not_kept("images", "no images of these views")
+    return list(zip(images.placing, images.step, strict=True))
 
 
 def _is_read(kept: Any) -> bool:
@@ -256,12 +237,47 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     """
     wrong = "no weights of this field"
     if not isinstance(kept, list | np.ndarray):
-        weight = kept_numbers({where: kept}, where, (), where, wrong) * field
+        weight = _kept_numbers({where: kept}, where, (), where, wrong) * field
     else:
-        weight = kept_numbers({where: kept}, where, field.shape, where, wrong)
+        weight = _kept_numbers({where: kept}, where, field.shape, where, wrong)
     if (weight < 0).any():
-        raise not_kept(where, wrong)
+        raise _not_kept(where, wrong)
     return weight
+
+
+def _kept_numbers(kept: Any, name: str, shape: tuple[int, ...], where: str, wrong: str, *,
+                  verb: str = "solve") -> np.ndarray:
+    """Return numbers that a result keeps under a name.
+
+    Parameters
+    ----------
+    kept : dict
+        What it keeps.
+    name : str
+        Which.
+    shape : tuple of int
+        Their shape; -1 where any number of them may be.
+    where, wrong, verb : str
+        Place, fault and the verb that writes it anew, for the message.
+
+    Raises
+    ------
+    InputError
+        If they are not such numbers.
+    """
+    try:
+        found = np.array(kept[name], dtype=float).reshape(shape)
+    except (TypeError, ValueError, KeyError):
+        found = np.array(np.nan)
+    if not np.isfinite(found).all():
+        raise _not_kept(where, wrong, verb)
+    return found
+
+
+def _not_kept(where: str, wrong: str, verb: str = "solve") -> InputError:
+    """Return the error of a result that does not keep what it should."""
+    return InputError(where, wrong, f"write the {'map' if verb == 'combine' else 'result'} again "
+                      f"with `selfcal {verb}`")
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +310,7 @@ class Together:
     @property
     def lacks_terms(self) -> bool:
         """Whether the uncertainty has contributions of terms that the result does not keep."""
-        return bool(self.result.model.terms and KEY not in self.result.extra)
+        return bool(self.result.model.terms and self.result.kept.factors is None)
 
     @property
     def half_width_m(self) -> float:
@@ -319,7 +335,7 @@ class Together:
         if not share_of(self.result):
             return None
         grid = self.system.grid
-        seen = _kept_cells(self.result, grid.n_views)
+        seen = _kept_cells(cast(ImagesKept, self.result.kept.images), grid.n_views)
         return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
                           np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
 
@@ -339,7 +355,7 @@ class Together:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
         if known.size > MAX_FULL or self.lacks_terms:
             return None
-        factors = factors_of(self.result)[:, :, known].reshape(-1, 2 * int(known.sum()))
+        factors = self._kept.of_map[:, :, known].reshape(-1, 2 * int(known.sum()))
         return self.of_noise(self.stage_rows(known)) + factors.T @ factors
 
     def of_lines(self, known: np.ndarray) -> np.ndarray | None:
@@ -362,36 +378,36 @@ class Together:
         at = len(known) + np.flatnonzero(known)
         return cover[np.ix_(at, at)] if lines[1][known].all() else None
 
-    @cached_property
-    def _effects(self) -> np.ndarray:
-        """Effects that are no terms of the model, for unit noise, (e, 2, nx, ny)."""
-        kept = self.result.extra.get(KEY, {}).get(BESIDE, {"with_map": 0})
-        return factors_of(self.result)[int(kept["with_map"]):]
+    @property
+    def _kept(self) -> Factors:
+        return factors_of(self.result)
 
-    @cached_property
+    @property
+    def _effects(self) -> np.ndarray:
+        """Effects that are not terms of the model, for unit noise, (e, 2, nx, ny)."""
+        return self._kept.of_map[self._kept.with_map:]
+
+    @property
     def _effects_on_plate(self) -> np.ndarray:
         """What they add to the variance of the plate's map, for unit noise, (2, nx, ny)."""
-        shape = (2, *self.marks.shape)
-        if not len(self._effects):
-            return np.zeros(shape)
-        return kept_numbers(self.result.extra[KEY], OF_PLATE, shape, KEY, "no effects on the plate")
+        added = self._kept.on_plate
+        return np.zeros((2, *self.marks.shape)) if added is None else added
+
+    def _beside(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the factors of a quantity beside the map in this shape, (r, ...)."""
+        return self._kept.beside.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
-        plate, stage = self._kept("plate", (2, *marks.shape)), factors_of(self.result)
+        plate, stage = self._beside("plate", (2, *marks.shape)), self._kept.of_map
         effects, here = len(self._effects), 2 * int(sites.sum())
         n, r = len(stage) - effects, len(plate)
         maps = np.zeros((r + effects, here + 2 * int(marks.sum()) + 4))
         of_stage = stage[:, :, sites].reshape(len(stage), here)
         maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
         maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
-        maps[:r, -4:] = self._kept(block_of_offsets().name, (4,)) / self.half_width_m
+        maps[:r, -4:] = self._beside(block_of_offsets().name, (4,)) / self.half_width_m
         return maps
-
-    def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the factors of a quantity beside the map, (r, ...)."""
-        kept = self.result.extra.get(KEY, {}).get(BESIDE, {name: []})
-        return kept_numbers(kept, name, (-1, *shape), KEY, f"no {name} of this plate")
 
     def cover(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the covariance of Gx, Gy at sites, Ax, Ay at marks, and the microscope.
@@ -428,7 +444,7 @@ class Together:
         """Variance of the stage's map over that of white noise and terms."""
         emap, known = self.result.error_map, self.sites
         white = np.trace(self.of_noise(self.stage_rows(known)))
-        factors = factors_of(self.result)[..., known]
+        factors = self._kept.of_map[..., known]
         white += (factors**2).sum()
         effects = (self._effects[..., known] ** 2).sum()
         found = (emap.u_gx[known] ** 2 + emap.u_gy[known] ** 2).sum()
@@ -441,7 +457,7 @@ class Together:
         plate, known = self.result.artifact_map, self.marks
         rows = unit_rows(known)
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
-        white += (self._kept("plate", (2, *known.shape))[..., known] ** 2).sum()
+        white += (self._beside("plate", (2, *known.shape))[..., known] ** 2).sum()
         found = (plate.u_ax[known] ** 2 + plate.u_ay[known] ** 2).sum()
         found -= self._effects_on_plate[:, known].sum() * self.result.noise.sigma_xy**2
         return float(found / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
@@ -464,7 +480,7 @@ class Together:
         stage, noise = lines_turned_over(result.sense, centre[:, :count].T), result.noise
         cover = LinesCovariance(self.maps, (noise.sigma_xy, noise.sigma_theta)).of(
             stage, centre[:, count:].T)
-        terms = self._kept("lines", (2 * count,)) @ centre.T * (
+        terms = self._beside("lines", (2 * count,)) @ centre.T * (
             noise.sigma_xy / self.half_width_m)
         cover = cover + terms.T @ terms
         white = np.diag(cover)[:count][known[0]].sum()
@@ -480,7 +496,7 @@ def behind(result: CalibrationResult) -> Together | None:
 
 def together(result: CalibrationResult) -> Together | None:
     """Return the joint covariance of stage and plate of a result; None if it is incomplete."""
-    incomplete = result.model.terms and BESIDE not in result.extra.get(KEY, {})
+    incomplete = result.model.terms and not factors_of(result).beside
     if incomplete or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
         return None
     found = behind(result)

@@ -21,11 +21,6 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import CellsSeen, View, cells_seen
 
-IMAGES = "images"
-"""Key of the noise of images in a result: its `share` in the variance of a reading, `dof_mark`, the
-degrees of freedom of that of a mark, and of each grid view the `placing` of the plate, a number,
-and the `step` (m, n) of its cell on the plate."""
-
 
 @dataclass(frozen=True)
 class TwoNoises:

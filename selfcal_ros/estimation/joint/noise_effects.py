@@ -20,9 +20,6 @@ from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.normal.equations import BLOCK
 from selfcal_ros.estimation.terms.visits import ViewVisits
 
-ADDED = "first_order_added"
-"""Key of what such noise adds to the variances of O and R times the half width, unit noise."""
-
 
 def axis_contrast(model: ModelFit) -> float:
     """Return (sx^2 - sy^2) / (sx^2 + sy^2) of the noises along the stage axes.

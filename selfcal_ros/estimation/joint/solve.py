@@ -17,7 +17,6 @@ from typing import Any, cast
 import numpy as np
 
 from selfcal_ros.errors import (
-    InputError,
     NoDataError,
     NotIdentifiableError,
     NotSettledError,
@@ -30,13 +29,9 @@ from selfcal_ros.estimation.datum.covariance import (
     misclosure_test,
     scale_of,
 )
-from selfcal_ros.estimation.joint.images import IMAGES, image_noise
+from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.model_fit import ModelFit, fit_model, placed
-from selfcal_ros.estimation.joint.noise_effects import (
-    ADDED,
-    image_variances,
-    structured,
-)
+from selfcal_ros.estimation.joint.noise_effects import image_variances, structured
 from selfcal_ros.estimation.joint.problem import (
     NEGLIGIBLE,
     NoiseEstimate,
@@ -65,6 +60,7 @@ from selfcal_ros.estimation.terms.equations import (
 )
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
+from selfcal_ros.model.kept import Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import (
     GridVisits,
     Measurements,
@@ -204,32 +200,16 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
             "count": count}
 
 
-KEY = "covariance_terms"
-"""Key of the factors in a result."""
-
-BESIDE = "beside"
-"""Key of what each factor makes of other quantities: `plate` (r, 2, nx, ny), as those of the map;
-`lines` (r, 2, K), the angular maps of stage and plate, and `microscope` (r, 4), its coefficients,
-both times the longer half width of the plate. The first `with_map` belong to the factors of the
-map, the others leave the map as it is."""
-
-OF_PLATE = "effects_on_plate"
-"""Key of what effects that are not terms of the model add to the variance of the plate's map for
-unit noise, (2, nx, ny)."""
-
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 """Coefficients of a microscope in their order."""
-
-ANGULAR_KEY = "angular_terms"
-"""Key of each term's contribution to the standard uncertainty of the angular map, rad."""
 
 DIGITS = 7
 """Digits of a factor stored."""
 
 
 def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
-                beside: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
-    """Return the factors for `CalibrationResult.extra`; empty without terms, or for large fields.
+                beside: dict[str, np.ndarray] | None = None) -> Factors | None:
+    """Return the factors of the terms; None for large fields.
 
     Parameters
     ----------
@@ -240,11 +220,11 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
     sense : Sense
         What moved: the factors are in the stage frame.
     beside : dict of float array (p, ...), optional
-        What a unit of each coefficient makes of other quantities, stage frame; see `BESIDE`.
+        What a unit of each coefficient makes of other quantities, see `Factors`.
     """
     shape, beside = cover.system.grid.views.shape, beside or {}
     if cover.system.grid.n_sites > MAX_FULL:
-        return {}
+        return None
     maps = cover.maps_of_terms()[0]
     maps = turned_over(sense, maps.reshape(*shape, maps.shape[1]), axes=(0, 1))
     both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
@@ -261,15 +241,15 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         moved += list((others @ root @ right[kept].T).T)
         left, size, _ = np.linalg.svd(others @ (root - root @ shown), full_matrices=False)
         alone += list((left * size).T[size > NEGLIGIBLE])
-    found = {"terms": names, "factors": rounded(np.array(factors)).tolist()}
-    if beside:
-        all_of = np.array([*moved, *alone]).reshape(-1, len(others))
-        ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
-        found[BESIDE] = {"with_map": len(names)} | {
-            name: rounded(part.reshape(len(part), *values.shape[1:])).tolist()
-            for (name, values), part in zip(beside.items(), np.split(all_of, ends, axis=1),
-                                            strict=True)}
-    return {KEY: found}
+    found = Factors(tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape)))
+    if not beside:
+        return found
+    all_of = np.array([*moved, *alone]).reshape(-1, len(others))
+    ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
+    return replace(found, with_map=len(names), beside={
+        name: rounded(part.reshape(len(part), *values.shape[1:]))
+        for (name, values), part in zip(beside.items(), np.split(all_of, ends, axis=1),
+                                        strict=True)})
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
@@ -283,65 +263,14 @@ def rounded(values: np.ndarray) -> np.ndarray:
     return np.where(size < ROUNDED, 0.0, np.round(values * power) / power)
 
 
-def factors_of(result: CalibrationResult) -> np.ndarray:
-    """Return the factors L of a result, (r, 2, nx, ny), for unit noise; r = 0 without terms.
-
-    Raises
-    ------
-    InputError
-        If they do not match the result's lattice.
-    """
-    shape = (2, *result.artifact.shape)
-    if KEY not in result.extra:
-        return np.zeros((0, *shape))
-    wrong = "no factors of this lattice"
-    factors = kept_numbers(result.extra[KEY], "factors", (-1, *shape), KEY, wrong)
-    terms = result.extra[KEY].get("terms")
-    if np.shape(terms) != (len(factors),):
-        raise not_kept(KEY, wrong)
-    return factors
-
-
-def kept_numbers(kept: Any, name: str, shape: tuple[int, ...], where: str, wrong: str, *,
-                 verb: str = "solve", finite: bool = True) -> np.ndarray:
-    """Return numbers that a result keeps under a name.
-
-    Parameters
-    ----------
-    kept : dict
-        What it keeps.
-    name : str
-        Which.
-    shape : tuple of int
-        Their shape; -1 where any number of them may be.
-    where, wrong, verb : str
-        Place, fault and the verb that writes it anew, for the message.
-    finite : bool
-        Whether none may be infinite.
-
-    Raises
-    ------
-    InputError
-        If they are not such numbers.
-    """
-    try:
-        found = np.array(kept[name], dtype=float).reshape(shape)
-    except (TypeError, ValueError, KeyError):
-        found = np.array(np.nan)
-    if not (np.isfinite(found) if finite else ~np.isnan(found)).all():
-        raise not_kept(where, wrong, verb)
-    return found
-
-
-def not_kept(where: str, wrong: str, verb: str = "solve") -> InputError:
-    """Return the error of a result that does not keep what it should."""
-    return InputError(where, wrong, f"write the {'map' if verb == 'combine' else 'result'} again "
-                      f"with `selfcal {verb}`")
+def factors_of(result: CalibrationResult) -> Factors:
+    """Return the factors of a result; none without terms."""
+    return result.kept.factors or Factors.none(result.artifact.shape)
 
 
 def angular_terms(cover: MapsCovariance, columns: TermColumns, sigma_m: float,
-                  known: np.ndarray) -> dict[str, Any]:
-    """Return the contribution of each term of the lines to the angular map, for `extra`: rad, (K,).
+                  known: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the contribution of each term of the lines to u of the angular map, rad, (K,).
 
     Parameters
     ----------
@@ -359,14 +288,14 @@ def angular_terms(cover: MapsCovariance, columns: TermColumns, sigma_m: float,
         moved = moved - moved[known].mean(axis=0)
         power = np.einsum("kp,pq,kq->k", moved, cover.terms.covariance[np.ix_(rows, rows)], moved)
         out[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
-    return {ANGULAR_KEY: out} if out else {}
+    return out
 
 
 def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
     """Return the variance of the map from each term with a size, (2, nx, ny), m^2."""
     factors = factors_of(result)
-    names = np.array(result.extra[KEY]["terms"] if len(factors) else [], dtype=str)
-    return {str(name): (factors[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
+    names = np.array(factors.terms, dtype=str)
+    return {str(name): (factors.of_map[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
             for name in dict.fromkeys(names.tolist()) if name != FREE}
 
 
@@ -488,8 +417,8 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
         noise_of(found.xy, found.theta),
         measurements.all_rejected(), findings=findings,
         sense=str(measurements.sense),
-        extra={**kept, **_kept_images(measurements, model),
-               **kept_residuals(measurements, model)},
+        extra=kept_residuals(measurements, model),
+        kept=replace(kept, images=_kept_images(measurements, model)),
         run_id=measurements.run_id,
         model=ModelResult("rigid" if problem.rigid else "linear", term_results(
             model, {term.name for term in options.terms})),
@@ -497,17 +426,16 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     return Solved(result, found.xy, found.theta, model, axes)
 
 
-def _kept_images(measurements: Measurements, model: ModelFit) -> dict[str, Any]:
-    """Return what a result keeps of the noise of images in its grid views, see `IMAGES`."""
+def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | None:
+    """Return what a result keeps of the noise of images in its grid views; None without."""
     views = [measurements.views[index].view for index in model.problem.grid.index]
     seen = cells_seen(measurements.artifact, views)
     if model.problem.images is None or seen is None:
-        return {}
+        return None
     noises = model.problem.images.noises(model.found.residuals)
     names = list(dict.fromkeys(name for name, _ in seen))
-    return {IMAGES: {"share": noises.share, "dof_mark": noises.dof_mark,
-                  "placing": [names.index(name) for name, _ in seen],
-                  "step": [list(step) for _, step in seen]}}
+    return ImagesKept(noises.share, noises.dof_mark, tuple(names.index(name) for name, _ in seen),
+                      tuple(step for _, step in seen))
 
 
 def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
@@ -578,17 +506,17 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
 
 def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovariance | None,
                sigma: np.ndarray, *, wanted: bool
-               ) -> tuple[ErrorMap, np.ndarray | None, dict[str, Any]]:
+               ) -> tuple[ErrorMap, np.ndarray | None, Kept]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
-    `sigma` is the noise of a reading as it counts at each site, m; the factors are those of
-    `selfcal_ros.estimation.joint.solve`. The uncertainty is given if it is `wanted`.
+    `sigma` is the noise of a reading as it counts at each site, m; what is kept is
+    without images. The uncertainty is given if it is `wanted`.
     """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
-    kept: dict[str, Any] = {}
+    kept = Kept()
     if cover is not None:
         lines = LinesCovariance(cover, (found.xy.sigma, found.theta.sigma))
         if wanted:
@@ -597,13 +525,14 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
                 more = structured(model, cover)
                 variance = variance + more
                 if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
-                    kept[ADDED] = structured(model, cover, system.gauge.shear)
+                    kept = Kept(added=np.asarray(structured(model, cover, system.gauge.shear)))
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
         if wanted and model.equations is not None:
-            kept |= saved_terms(cover, model.equations.columns, measurements.sense,
-                                _beside_map(model, lines, measurements.sense))
-            kept |= angular_terms(cover, model.equations.columns, found.xy.sigma,
-                                  system.known_lines)
+            columns = model.equations.columns
+            kept = replace(
+                kept, factors=saved_terms(cover, columns, measurements.sense,
+                                          _beside_map(model, lines, measurements.sense)),
+                angular=angular_terms(cover, columns, found.xy.sigma, system.known_lines))
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if wanted else u_theta

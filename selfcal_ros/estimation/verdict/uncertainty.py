@@ -14,13 +14,7 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
-from selfcal_ros.estimation.joint.solve import (
-    ANGULAR_KEY,
-    KEY,
-    OF_PLATE,
-    rounded,
-    variance_of_terms,
-)
+from selfcal_ros.estimation.joint.solve import factors_of, rounded, variance_of_terms
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.options import OWED
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
@@ -94,29 +88,29 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     effects = [effect for effect in effects if effect.xy.any() or effect.theta.any()]
     if not effects:
         return result
-    emap, plate, extra = result.error_map, result.artifact_map, dict(result.extra)
+    emap, plate, kept = result.error_map, result.artifact_map, result.kept
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     of_plate = sum((np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
                     for effect in effects), np.zeros((2, *plate.ax.shape)))
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
-        kept = extra.get(KEY, {"terms": [], "factors": []})
-        factors = [rounded(effect.xy / result.noise.sigma_xy).tolist() for effect in effects]
-        extra[KEY] = {**kept, "terms": [*kept["terms"], *(effect.name for effect in effects)],
-                      "factors": [*kept["factors"], *factors], OF_PLATE: rounded(
-                          of_plate / result.noise.sigma_xy**2).tolist()}
-    turned = dict(extra.get(ANGULAR_KEY, {}))
+        before, sigma = factors_of(result), result.noise.sigma_xy
+        kept = replace(kept, factors=replace(
+            before, terms=(*before.terms, *(effect.name for effect in effects)),
+            of_map=np.concatenate([before.of_map, [
+                rounded(effect.xy / sigma) for effect in effects]]),
+            on_plate=rounded(of_plate / sigma**2)))
+    turned = dict(kept.angular)
     for effect in effects:
         if effect.theta.any():
-            turned[effect.name] = np.hypot(turned.get(effect.name, 0.0), effect.theta).tolist()
-    if turned:
-        extra[ANGULAR_KEY] = turned
+            turned[effect.name] = np.hypot(turned.get(effect.name, 0.0), effect.theta)
+    kept = replace(kept, angular=turned)
     emap = replace(emap, u_gx=np.sqrt(emap.u_gx**2 + power[0]),
                    u_gy=np.sqrt(emap.u_gy**2 + power[1]), u_g_theta=u_theta)
     if plate.u_ax.size:
         plate = replace(plate, u_ax=np.sqrt(plate.u_ax**2 + of_plate[0]),
                         u_ay=np.sqrt(plate.u_ay**2 + of_plate[1]))
-    return replace(result, error_map=emap, artifact_map=plate, extra=extra)
+    return replace(result, error_map=emap, artifact_map=plate, kept=kept)
 
 
 def enlargements(result: CalibrationResult, names: Iterable[str],
@@ -129,8 +123,8 @@ def enlargements(result: CalibrationResult, names: Iterable[str],
     found = [Enlargement(name, float(np.sqrt(power.mean())), float(np.sqrt(power.max())))
              for name in dict.fromkeys(names) if (power := variance.get(name)) is not None]
     for name in dict.fromkeys(names):
-        if name in result.extra.get(ANGULAR_KEY, {}):
-            u = np.asarray(result.extra[ANGULAR_KEY][name])
+        if name in result.kept.angular:
+            u = result.kept.angular[name]
             found.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
     for effect in effects:
         values = effect.xy if effect.unit == "m" else effect.theta
@@ -172,9 +166,8 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
     """
     noise, emap = result.noise, result.error_map
     terms = {term.name: term for term in result.model.terms}
-    of_lines = sum((np.asarray(u, dtype=float) ** 2
-                    for name, u in result.extra.get(ANGULAR_KEY, {}).items()
-                    if _not_told(terms.get(name))), np.zeros(emap.u_g_theta.shape))
+    of_lines = sum((u**2 for name, u in result.kept.angular.items() if _not_told(terms.get(name))),
+                   np.zeros(emap.u_g_theta.shape))
     changed: dict[str, float] = {}
     for kind, power, known in (
             ("xy", emap.u_xy ** 2, known_beforehand(result)),
@@ -296,11 +289,9 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     yield _reference_line(np.sqrt(of_reference), result.reference)
     yield _interpolation_xy(result)
     if np.isfinite(emap.u_g_theta).any():
-        kept = {name: np.asarray(u, dtype=float)
-                for name, u in result.extra.get(ANGULAR_KEY, {}).items()}
-        own = emap.u_g_theta**2 - sum(u**2 for u in kept.values())
+        own = emap.u_g_theta**2 - sum(u**2 for u in result.kept.angular.values())
         yield _noise_line("theta", np.sqrt(np.maximum(own, 0.0)), noise)
-        for name, u in kept.items():
+        for name, u in result.kept.angular.items():
             yield _term_line("theta", name, u, result)
         yield _interpolation_theta(result)
 

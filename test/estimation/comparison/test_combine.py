@@ -197,8 +197,8 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
         truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True),
         Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")))
     found = combine(thrice(result))
-    factors = np.array(result.extra["covariance_terms"]["factors"])
-    of = np.array(result.extra["covariance_terms"]["terms"]) == "microscope"
+    factors = result.kept.factors.of_map
+    of = np.array(result.kept.factors.terms) == "microscope"
     assert of.any()
     shared = (factors[of] ** 2).sum(axis=0).ravel() * result.noise.sigma_xy**2
     np.testing.assert_allclose(found.xy.common, shared, rtol=0.02, atol=1e-3 * shared.max())

@@ -16,6 +16,7 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.comparison.maps import compare
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.kept import Kept
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
@@ -76,7 +77,7 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     assert np.sqrt(np.diag(wanted)) == pytest.approx(u, rel=1e-6)
     shear = first_order_u(saved)
     assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
-    alone = replace(saved, extra={})
+    alone = replace(saved, kept=Kept())
     assert covariance_of(alone, "xy", known).ndim == 1
     assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
 
@@ -89,13 +90,6 @@ def test_weights_that_are_none_are_refused(read, message):
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
     with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result again"):
         covariance_of(replace(result, views=views), "xy", result.error_map.valid)
-
-
-def test_factors_of_another_lattice_are_refused():
-    result = calibrate(measured(PLAN, 1), BARE)
-    extra = {"covariance_terms": {"terms": [""], "factors": [[[1.0, 2.0], [3.0, 4.0]]]}}
-    with pytest.raises(InputError, match="covariance_terms: no factors of this lattice"):
-        covariance_of(replace(result, extra=extra), "xy", result.error_map.valid)
 
 
 def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import together
 from selfcal_ros.estimation.joint import solve
-from selfcal_ros.estimation.joint.solve import KEY
 from selfcal_ros.estimation.terms import equations
 from selfcal_ros.estimation.verdict import judge
 from selfcal_ros.model.readings import Sense
@@ -78,12 +76,7 @@ def test_what_is_not_kept_is_not_known():
     result, _ = both(measured("oblong", "sized"), "sized",
                      misalignment_model="linear", at_places=False)
     assert together(saved(result)) is not None
-    kept = dict(result.extra[KEY])
-    del kept["beside"]
-    assert together(replace(result, extra={**result.extra, KEY: kept})) is None
+    kept = replace(result.kept, factors=replace(result.kept.factors, beside={}))
+    assert together(replace(result, kept=kept)) is None
     assert together(replace(result, views=tuple(
         replace(view, read_grid=None) for view in result.views))) is None
-    damaged = {**result.extra[KEY], "beside": {"with_map": 1, "plate": [1.0, 2.0]}}
-    known = together(replace(result, extra={**result.extra, KEY: damaged}))
-    with pytest.raises(InputError, match="no plate of this plate"):
-        known.cover(known.sites, known.marks)

@@ -55,8 +55,8 @@ def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlat
     _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
     assert np.allclose(emap.u_gx, u_x, rtol=1e-6, atol=0)
     assert np.allclose(emap.u_gy, u_y, rtol=1e-6, atol=0)
-    white = first_order_u(replace(result, extra={
-        key: value for key, value in result.extra.items() if key != noise_effects.ADDED}))
+    white = first_order_u(replace(result, kept=replace(
+        result.kept, added=None)))
     found = first_order_u(result)
     assert found == pytest.approx(u_of_first_order(dense, readings.artifact), rel=1e-5)
     assert found != pytest.approx(white, rel=0.02)

@@ -12,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.camera import Distortion, straight_products
-from selfcal_ros.estimation.joint.images import IMAGES, image_noise
+from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.equations import system_for
@@ -209,7 +209,7 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
     assert all(camera.degree == 3 for camera in cameras)
     mark, image = (np.mean([getattr(camera, name) ** 2 for camera in cameras])
                    for name in ("noise_mark", "noise_image"))
-    dof = sum(found.extra[IMAGES]["dof_mark"] for _, found in results)
+    dof = sum(found.kept.images.dof_mark for _, found in results)
     assert mark == pytest.approx(MARK**2, rel=3 * np.sqrt(2 / dof))
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
     for camera in cameras:  # published offsets are (1 + E)^-1 times the true ones, then distorted

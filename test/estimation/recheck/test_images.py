@@ -11,7 +11,6 @@ from scipy.stats import binom
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import together
-from selfcal_ros.estimation.joint.images import IMAGES
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
@@ -56,7 +55,7 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
                                 change=3e-8, phi_rad=0.0)
     first = solve_joint(before, LINEAR).result
     found = recheck(after, LINEAR, known_plate(first, "r.json"))
-    share, power, sites = first.extra[IMAGES]["share"], first.noise.sigma_xy**2, 25
+    share, power, sites = first.kept.images.share, first.noise.sigma_xy**2, 25
     assert share > 0.3
     later = found.noise.sigma_xy**2
 
@@ -102,7 +101,7 @@ def test_both_maps_of_a_calibration_with_noise_of_images_as_dense_linear_algebra
     _, before, _ = sessions(3 * MARK, 5, size=5, missing=missing, phi_rad=0.0)
     first = solve_joint(before, LINEAR).result
     kept, project = together(first), datum(before.artifact)
-    (matrix, stops), share = dense(before), first.extra[IMAGES]["share"]
+    (matrix, stops), share = dense(before), first.kept.images.share
     inverse = np.linalg.pinv(matrix, rcond=1e-10)
     z = np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel() * 1.0
     grown = np.outer(z, z) / (z @ z)
@@ -172,6 +171,6 @@ def test_what_a_view_with_images_will_tell_is_predicted():
 def test_a_plate_calibrated_with_one_mark_an_image_does_not_tell_its_noise():
     _, before, after = sessions(MARK, 1, size=5)
     first = calibrate(before)
-    alone = replace(first, extra={k: v for k, v in first.extra.items() if k != IMAGES})
+    alone = replace(first, kept=replace(first.kept, images=None))
     with pytest.raises(InputError, match="not separated into that of images and that of marks"):
         calibrate(after, Options(plate=alone, plate_from="r.json"))

@@ -63,7 +63,7 @@ def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(
     assert plain.verdict.grade is wanted.verdict.grade is Grade.NOT_QUALIFIED
     for name in ("u_gx", "u_gy", "u_g_theta"):
         assert np.isnan(getattr(plain.error_map, name)).all()
-    assert "covariance_terms" not in plain.extra
+    assert plain.kept.factors is None
 
 
 @pytest.mark.parametrize(("side", "asked", "failed", "wanted"), [

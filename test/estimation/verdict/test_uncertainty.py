@@ -75,7 +75,7 @@ def test_a_saved_map_has_the_covariance_of_its_effects(result):
     known = result.error_map.valid
     larger = enlarged(result, (slip, turned, nothing))
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(larger)))), "r")
-    assert saved.extra["covariance_terms"]["terms"][-2:] == ["slip", "rotation"]
+    assert saved.kept.factors.terms[-2:] == ("slip", "rotation")
     found = covariance_of(saved, "xy", known)
     wanted = covariance_of(result, "xy", known)
     for effect in (slip, turned):
@@ -123,7 +123,7 @@ def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
     assert (by_name["slip"].u_max, by_name["slip"].unit) == (abs(slip.xy).max(), "m")
     assert by_name["reading"].u_rms == pytest.approx(np.sqrt(np.mean(turned.theta**2)))
     assert by_name["reading"].unit == by_name["line_eccentricity"].unit == "rad"
-    lines = np.array(result.extra["angular_terms"]["line_eccentricity"])
+    lines = result.kept.angular["line_eccentricity"]
     assert by_name["line_eccentricity"].u_max == pytest.approx(lines.max(), rel=1e-12)
     # a strain of 2e-7 that no reading tells bends a plate of 20 mm by 4 nm
     assert 1e-9 < by_name["plate_strain"].u_rms < 1e-8

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a result keeps beside its maps, so that their covariances follow from its file alone."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from selfcal_ros.files import read
+from selfcal_ros.outputs import plain
+
+FACTORS, ANGULAR, ADDED, IMAGES = KEYS = (
+    "covariance_terms", "angular_terms", "first_order_added", "images")
+"""Keys in RESULT.json."""
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """What terms of the model, and effects beside it, make of the maps, for unit noise.
+
+    Unit noise is that of one grid reading; all is in the stage frame.
+
+    Attributes
+    ----------
+    terms : tuple of str
+        The term, or the effect, that each factor belongs to.
+    of_map : float array (r, 2, nx, ny)
+        Factors L of the covariance L' L of Gx, then Gy.
+    beside : dict of float array (s, ...)
+        What each factor makes of other quantities: `plate` (s, 2, nx, ny), as those of the map;
+        `lines` (s, 2, K), the angular maps of stage and plate, and those of the block of the
+        offsets, (s, 4), its coefficients, both times the longer half width of the plate. Empty:
+        not kept.
+    with_map : int
+        So many of `beside` belong to the first factors of the map, the others leave it as it is.
+    on_plate : float array (2, nx, ny), optional
+        What effects that are not terms of the model add to the variance of the plate's map.
+    """
+
+    terms: tuple[str, ...]
+    of_map: np.ndarray
+    beside: Mapping[str, np.ndarray] = field(default_factory=dict)
+    with_map: int = 0
+    on_plate: np.ndarray | None = None
+
+    @classmethod
+    def none(cls, shape: tuple[int, ...]) -> "Factors":
+        """Return that there is none on a map of this shape."""
+        return cls((), np.zeros((0, 2, *shape)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        out: dict[str, Any] = {"terms": list(self.terms), "factors": plain(self.of_map)}
+        if self.beside:
+            out["beside"] = {"with_map": self.with_map, **plain(dict(self.beside))}
+        if self.on_plate is not None:
+            out["effects_on_plate"] = plain(self.on_plate)
+        return out
+
+
+@dataclass(frozen=True)
+class ImagesKept:
+    """Noise of images with several marks.
+
+    Attributes
+    ----------
+    share : float
+        Part of the variance of a reading that the marks of an image have in common.
+    dof_mark : float
+        Degrees of freedom of the noise of a mark by itself.
+    placing : tuple of int
+        Number of the placing of the plate in each grid view.
+    step : tuple of (int, int)
+        Step (m, n) of the cell of each grid view on the plate.
+    """
+
+    share: float
+    dof_mark: float
+    placing: tuple[int, ...]
+    step: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """All that a result keeps for the covariances of its maps.
+
+    Attributes
+    ----------
+    factors : Factors, optional
+        Of terms and effects; None without, or where the field is too large.
+    angular : dict of float array (K,)
+        Contribution of each term and effect to the standard uncertainty of the angular map, rad.
+    added : float array (2,), optional
+        What unequal noise adds to the variances of O and R times the half width, unit noise.
+    images : ImagesKept, optional
+        Of readings that come from images with several marks.
+    """
+
+    factors: Factors | None = None
+    angular: Mapping[str, np.ndarray] = field(default_factory=dict)
+    added: np.ndarray | None = None
+    images: ImagesKept | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form: the keys of what there is."""
+        parts = {ADDED: self.added, FACTORS: self.factors and self.factors.to_dict(),
+                 ANGULAR: dict(self.angular) or None, IMAGES: self.images}
+        return {key: plain(part) for key, part in parts.items() if part is not None}
+
+
+def kept_from_dict(data: Mapping[str, Any], of_map: tuple[int, ...],
+                   of_plate: tuple[int, ...], lines: int) -> Kept:
+    """Return what a result keeps from its JSON form.
+
+    Parameters
+    ----------
+    data : dict
+        The result.
+    of_map, of_plate : tuple of int
+        Shapes of both maps.
+    lines : int
+        K.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If it is damaged.
+    """
+    images = read(ImagesKept | None, data.get(IMAGES))
+    if images is not None and not (0 <= images.share <= 1 and images.dof_mark >= 0 and all(
+            len(step) == 2 for step in images.step)):
+        raise ValueError(f"{IMAGES}: no noise of images")
+    return Kept(
+        _factors(data[FACTORS], of_map, of_plate, lines) if FACTORS in data else None,
+        {name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines")
+         for name, u in read(dict, data.get(ANGULAR, {})).items()},
+        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None, images)
+
+
+def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...],
+             lines: int) -> Factors:
+    kept = read(dict, data)
+    terms = read(tuple[str, ...], kept["terms"])
+    factors = _numbers(kept["factors"], (len(terms), 2, *of_map), FACTORS,
+                       "no factors of this lattice")
+    shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
+    beside = dict(read(dict, kept.get("beside", {})))
+    with_map, known = read(int, beside.pop("with_map", 0)), {}
+    for name, values in beside.items():
+        known[name] = _numbers(values, (len(read(list, values)), *shapes.get(name, (4,))), FACTORS,
+                               f"no {name} of this plate")
+    on_plate = kept.get("effects_on_plate")
+    return Factors(terms, factors, known, with_map, None if on_plate is None else _numbers(
+        on_plate, (2, *of_plate), FACTORS, "no effects on the plate"))
+
+
+def _numbers(value: Any, shape: tuple[int, ...], where: str, wrong: str) -> np.ndarray:
+    """Return finite numbers of a shape; ValueError says where they are wrong, and what is."""
+    try:
+        found = read(np.ndarray, value).reshape(shape)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {wrong}") from error
+    if not np.isfinite(found).all():
+        raise ValueError(f"{where}: {wrong}")
+    return found

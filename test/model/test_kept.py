@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a result keeps for the covariances of its maps: as JSON and back, and damaged."""
+
+import json
+
+import numpy as np
+import pytest
+
+from selfcal_ros.model.kept import Factors, ImagesKept, Kept, kept_from_dict
+
+MAP, PLATE, LINES = (3, 2), (4, 5), 6
+RNG = np.random.default_rng(1)
+FULL = Kept(
+    Factors(("drift", "slip"), RNG.normal(size=(2, 2, *MAP)),
+            {"plate": RNG.normal(size=(3, 2, *PLATE)), "lines": RNG.normal(size=(3, 2, LINES)),
+             "microscope": RNG.normal(size=(3, 4))}, 1, RNG.random((2, *PLATE))),
+    {"drift": RNG.random(LINES)}, RNG.random(2),
+    ImagesKept(0.25, 80.0, (0, 0, 1), ((0, 0), (1, -1), (0, 0))))
+
+
+def test_json_keeps_all_of_it_to_the_last_bit():
+    data = json.loads(json.dumps(FULL.to_dict()))
+    found = kept_from_dict(data, MAP, PLATE, LINES)
+    assert found.to_dict() == data
+    assert found.images == FULL.images and found.factors.terms == FULL.factors.terms
+    assert found.factors.with_map == 1
+    np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
+    np.testing.assert_array_equal(found.factors.beside["lines"], FULL.factors.beside["lines"])
+    np.testing.assert_array_equal(found.angular["drift"], FULL.angular["drift"])
+
+
+def test_nothing_is_kept_of_nothing():
+    assert Kept().to_dict() == {}
+    found = kept_from_dict({"plan_id": "p"}, MAP, PLATE, LINES)
+    assert (found.factors, found.added, found.images) == (None, None, None)
+    assert not found.angular
+
+
+@pytest.mark.parametrize(("where", "value", "message"), [
+    (("covariance_terms", "factors"), [[[1.0, 2.0]]], "covariance_terms: no factors of this latt"),
+    (("covariance_terms", "factors"), "no", "covariance_terms: no factors of this lattice"),
+    (("covariance_terms", "terms"), ["drift"], "covariance_terms: no factors of this lattice"),
+    (("covariance_terms", "beside", "plate"), [1.0, 2.0], "covariance_terms: no plate of this"),
+    (("covariance_terms", "beside", "lines"), None, "None is not of type list"),
+    (("covariance_terms", "effects_on_plate"), [[None]], "covariance_terms: no effects on the pl"),
+    (("angular_terms", "drift"), [0.1] * (LINES + 1), "angular_terms: no contributions to these"),
+    (("angular_terms", "drift"), [None] * LINES, "angular_terms: no contributions to these lines"),
+    (("first_order_added",), [0.1], "first_order_added: not two variances"),
+    (("images", "share"), 1.5, "images: no noise of images"),
+    (("images", "share"), None, "images: no noise of images"),
+    (("images", "dof_mark"), -1.0, "images: no noise of images"),
+    (("images", "step"), [[0], [1], [0]], "images: no noise of images")])
+def test_what_is_damaged_is_refused(where, value, message):
+    data = json.loads(json.dumps(FULL.to_dict()))
+    inner = data
+    for key in where[:-1]:
+        inner = inner[key]
+    inner[where[-1]] = value
+    with pytest.raises((KeyError, TypeError, ValueError), match=message):
+        kept_from_dict(data, MAP, PLATE, LINES)
