@@ -26,7 +26,7 @@ from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.cell_faults import explaining
 from selfcal_ros.sessions.health import Level, Ports
-from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS
+from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS, UM_PER_M
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
 """Settings of the run: marks per side in the middle of the plate, repeats, check offset."""
@@ -448,6 +448,12 @@ class CellCheck:
             what = f"the offsets are {factor:.3g} times as large as the motion of the stage"
             remedy = ("divide pixel_size by this factor, or find it with selfcal camera init: no "
                       "map would be qualified")
+        if stops and not shown and not what:
+            moved_um, seen_um = _spreads_um(view.motion)
+            what = (f"the offsets do not follow the stage: between the stops at a mark it moves by "
+                    f"{moved_um:.3g} um rms, they by {seen_um:.3g} um")
+            remedy = ("measure the offset anew in each image, and publish it in m: check the unit "
+                      "and pixel_size")
         self._tell("signs", shown and not faults,
                    what or f"offset against stage {figure or 'not known'} (-1 expected)",
                    remedy or "let the stage stop off the marks: check stops")
@@ -462,6 +468,16 @@ def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
     place, offset, both = (float(motion.products[at]) for at in (
         (axis, axis), (n + axis, n + axis), (axis, n + axis)))
     return both / place if both**2 > FOLLOWS * place * offset else None
+
+
+def _spreads_um(motion: RepeatMotion | None) -> tuple[float, float]:
+    """Return the rms spread of position and of offset among repeats, um; 0 without repeats."""
+    if motion is None or motion.dof <= 0:
+        return 0.0, 0.0
+    n = len(motion.products) // 2
+    squares = np.diag(motion.products).reshape(2, n).sum(axis=1)
+    position, offset = np.sqrt(squares / motion.dof) * UM_PER_M
+    return float(position), float(offset)
 
 
 def _turned_deg(motion: RepeatMotion | None) -> float | None:

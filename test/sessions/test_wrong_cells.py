@@ -32,6 +32,7 @@ class Cell(Bench):
         self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
         self.planned = iter(())  # a view without an end is exposed only until it is aborted
         self.view, self.position, self.late = None, self.home, []  # in transit
+        self.noise = np.random.default_rng(1)
         self.came = 1.0  # sign of the last motion along x
 
     def obey(self, fields):
@@ -109,6 +110,12 @@ class Cell(Bench):
             seen = seen | {key: 1e3 * seen[key] for key in ("offset_x", "offset_y")}
         if self.fault == "pixels too large":
             seen = seen | {key: 1.3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "no offsets":
+            seen = seen | {"offset_x": 0.0, "offset_y": 0.0}
+        if self.fault == "offsets 1000 times too small":
+            noise = self.noise.normal(scale=2e-8, size=2)
+            seen = seen | {key: 1e-3 * seen[key] + float(one) for key, one in
+                           zip(("offset_x", "offset_y"), noise, strict=True)}
         if self.fault == "backlash":
             seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
         if self.fault == "m and n exchanged":
@@ -154,6 +161,8 @@ WRONG = [
     ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
     ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
     ("pixels too large", "signs", "the offsets are 1.3 times as large as the motion of the stage"),
+    ("no offsets", "signs", "the offsets do not follow the stage: between the stops at a mark"),
+    ("offsets 1000 times too small", "signs", "it moves by 27 um rms, they by 0.05"),
     ("backlash", "marks", "16 outlier_among_repeats"),
     ("m and n exchanged", "ids", "m and n are exchanged"),
     ("x and y exchanged", "ids", "x and y are exchanged"),
@@ -171,6 +180,8 @@ WRONG = [
 
 REMEDIES = {"arrives late": "publish each detection as soon as it is found",
             "pixels too large": "divide pixel_size by this factor",
+            "no offsets": "measure the offset anew in each image, and publish it in m",
+            "offsets 1000 times too small": "measure the offset anew in each image",
             "backlash": "repeats of a mark contradict each other; check the stage for backlash",
             "old stamps": "stamp detections at the instant of exposure",
             "x and y exchanged": "exchange joint_x and joint_y", "reversed x": "reverse the sign"}
