@@ -10,9 +10,54 @@ import numpy as np
 from selfcal_ros.files import read
 from selfcal_ros.outputs import plain
 
-FACTORS, ANGULAR, ADDED, IMAGES = KEYS = (
-    "covariance_terms", "angular_terms", "first_order_added", "images")
+FACTORS, ANGULAR, ADDED, IMAGES, COVARIANCE = KEYS = (
+    "covariance_terms", "angular_terms", "first_order_added", "images", "map_covariance")
 """Keys in RESULT.json."""
+
+DIGITS = 7
+"""Digits that are kept of a number."""
+
+LEAST = 1e-12
+"""Smallest number that is kept: smaller ones are rounding."""
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Return values rounded to `DIGITS` digits, none smaller than `LEAST`.
+
+    As quotients of an exact power of ten, so that they print with no more digits.
+    """
+    size = np.abs(values)
+    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, LEAST)))
+    power = 10.0 ** np.maximum(digits, 0.0)
+    return np.where(size < LEAST, 0.0, np.round(values * power) / power)
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of the known values of a map, Gx, then Gy, or Gtheta.
+
+    Attributes
+    ----------
+    lower : float array (n (n + 1) / 2,)
+        Its lower triangle, in units of `scale`.
+    scale : float
+        m^2 or rad^2.
+    """
+
+    lower: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, matrix: np.ndarray) -> "Covariance":
+        """Return that of a matrix (n, n), rounded."""
+        scale = float(np.diag(matrix).mean())
+        return cls(rounded(matrix[np.tril_indices(len(matrix))] / scale), scale)
+
+    def matrix(self, n: int) -> np.ndarray:
+        """Return it in full, (n, n); ValueError if it is not of n values."""
+        full = np.zeros((n, n))
+        full[np.tril_indices(n)] = self.lower.reshape(n * (n + 1) // 2) * self.scale
+        return full + np.tril(full, -1).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,17 +140,22 @@ class Kept:
         What unequal noise adds to the variances of O and R times the half width, unit noise.
     images : ImagesKept, optional
         Of readings that come from images with several marks.
+    covariances : dict of Covariance
+        ``xy``, ``theta`` -> that of a mean map or of a recheck.
     """
 
     factors: Factors | None = None
     angular: Mapping[str, np.ndarray] = field(default_factory=dict)
     added: np.ndarray | None = None
     images: ImagesKept | None = None
+    covariances: Mapping[str, Covariance] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form: the keys of what there is."""
         parts = {ADDED: self.added, FACTORS: self.factors and self.factors.to_dict(),
-                 ANGULAR: dict(self.angular) or None, IMAGES: self.images}
+                 ANGULAR: dict(self.angular) or None, IMAGES: self.images, COVARIANCE: {
+                     key: value for kind, kept in self.covariances.items() for key, value in (
+                         (kind, kept.lower), (f"scale_{kind}", kept.scale))} or None}
         return {key: plain(part) for key, part in parts.items() if part is not None}
 
 
@@ -135,7 +185,11 @@ def kept_from_dict(data: Mapping[str, Any], of_map: tuple[int, ...],
         _factors(data[FACTORS], of_map, of_plate, lines) if FACTORS in data else None,
         {name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines")
          for name, u in read(dict, data.get(ANGULAR, {})).items()},
-        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None, images)
+        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None, images,
+        {kind: Covariance(_numbers(stored[kind], (-1,), COVARIANCE, "not a triangle of numbers"),
+                          read(float, stored[f"scale_{kind}"]))
+         for stored in (read(dict, data.get(COVARIANCE, {})),) for kind in ("xy", "theta")
+         if kind in stored})
 
 
 def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...],

@@ -184,7 +184,8 @@ class Noise:
 class CalibrationResult:
     """The result of a calibration.
 
-    `recheck` is what views of a known plate show to have changed; None of a calibration. `camera`
+    `kept` is what the covariances of the maps follow from, `extra` tables for reports. `recheck` is
+    what views of a known plate show to have changed; None of a calibration. `camera`
     and `stage_yaw` are what images of several marks show, None without.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from selfcal_ros.model.kept import Factors, ImagesKept, Kept, kept_from_dict
+from selfcal_ros.model.kept import Covariance, Factors, ImagesKept, Kept, kept_from_dict
 
 MAP, PLATE, LINES = (3, 2), (4, 5), 6
 RNG = np.random.default_rng(1)
@@ -15,7 +15,8 @@ FULL = Kept(
             {"plate": RNG.normal(size=(3, 2, *PLATE)), "lines": RNG.normal(size=(3, 2, LINES)),
              "microscope": RNG.normal(size=(3, 4))}, 1, RNG.random((2, *PLATE))),
     {"drift": RNG.random(LINES)}, RNG.random(2),
-    ImagesKept(0.25, 80.0, (0, 0, 1), ((0, 0), (1, -1), (0, 0))))
+    ImagesKept(0.25, 80.0, (0, 0, 1), ((0, 0), (1, -1), (0, 0))),
+    {"xy": Covariance.of(np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18)})
 
 
 def test_json_keeps_all_of_it_to_the_last_bit():
@@ -27,6 +28,14 @@ def test_json_keeps_all_of_it_to_the_last_bit():
     np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
     np.testing.assert_array_equal(found.factors.beside["lines"], FULL.factors.beside["lines"])
     np.testing.assert_array_equal(found.angular["drift"], FULL.angular["drift"])
+    np.testing.assert_allclose(found.covariances["xy"].matrix(2),
+                               np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_a_covariance_of_another_number_of_values_is_refused(n):
+    with pytest.raises(ValueError, match="reshape"):
+        FULL.covariances["xy"].matrix(n)
 
 
 def test_nothing_is_kept_of_nothing():
@@ -46,6 +55,8 @@ def test_nothing_is_kept_of_nothing():
     (("angular_terms", "drift"), [0.1] * (LINES + 1), "angular_terms: no contributions to these"),
     (("angular_terms", "drift"), [None] * LINES, "angular_terms: no contributions to these lines"),
     (("first_order_added",), [0.1], "first_order_added: not two variances"),
+    (("map_covariance", "xy"), [1.0, None], "map_covariance: not a triangle of numbers"),
+    (("map_covariance", "scale_xy"), "1", "'1' is not a number"),
     (("images", "share"), 1.5, "images: no noise of images"),
     (("images", "share"), None, "images: no noise of images"),
     (("images", "dof_mark"), -1.0, "images: no noise of images"),

@@ -19,7 +19,7 @@ from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import BEYOND, SHOWN
-from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariance
+from selfcal_ros.estimation.comparison.covariance import covariance_of, kept_covariances
 from selfcal_ros.estimation.comparison.maps import (
     KINDS,
     ReducedNoise,
@@ -716,7 +716,8 @@ def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str,
         Noise(np.nan, np.nan, dof_xy=dof["xy"], dof_theta=dof["theta"], k_xy=k["xy"],
               k_theta=k["theta"], dof_map_xy=dof["xy"], dof_map_theta=dof["theta"]),
         input={"file": ", ".join(part.name for part in parts)}, method=COMBINED,
-        sense=first.sense, extra=_extra(parts, means), verdict=_verdict(parts, means),
+        sense=first.sense, extra={COMBINED: _runs(parts, means)},
+        kept=kept_covariances(_covariances(parts, means)), verdict=_verdict(parts, means),
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
         provenance=Provenance(version=__version__, extra=exposures(runs)),
@@ -726,8 +727,8 @@ def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str,
     return replace(found, budget=_budget(found, means))
 
 
-def _extra(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
-    """Return the runs with their deviations, and the covariance of the mean."""
+def _runs(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
+    """Return the runs with their deviations."""
     facts: dict[str, Any] = {}
     for kind, mean in means.items():
         facts |= {f"u_between_{KINDS[kind]}": mean.u_between,
@@ -740,12 +741,16 @@ def _extra(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
         for kind, mean in means.items():
             run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(parts))
         facts["runs"].append(run)
+    return facts
+
+
+def _covariances(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, np.ndarray]:
+    """Return the covariances of the means whose runs all have theirs."""
     own = all(part.result is not None for part in parts)
-    covers = {kind: mean.covariance for kind, mean in means.items()
-              if (own or kind == "theta") and mean.covariance.ndim == 2 and all(
-                  deviation.test is None or deviation.test.correlated
-                  for deviation in mean.deviations)}
-    return {COMBINED: facts, **kept_covariance(covers)}
+    return {kind: mean.covariance for kind, mean in means.items()
+            if (own or kind == "theta") and mean.covariance.ndim == 2 and all(
+                deviation.test is None or deviation.test.correlated
+                for deviation in mean.deviations)}
 
 
 def _of_run(found: Deviation, kind: str, limit: float) -> dict[str, Any]:

@@ -26,23 +26,18 @@ from selfcal_ros.estimation.datum.covariance import (
 )
 from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
 from selfcal_ros.estimation.joint.problem import bounded_ratio
-from selfcal_ros.estimation.joint.solve import factors_of, rounded
+from selfcal_ros.estimation.joint.solve import factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.kept import Factors, ImagesKept
+from selfcal_ros.model.kept import Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import View, shared_rotations
-
-COVARIANCE = "map_covariance"
-"""Key of the covariance of a mean map or of a recheck: lower triangles over Gx, then Gy, of the
-known sites (`xy`), and of the known lines (`theta`), in units of `scale_xy` (m^2) and `scale_theta`
-(rad^2)."""
 
 
 def covariance_of(result: CalibrationResult, kind: str, known: np.ndarray, *,
@@ -71,7 +66,7 @@ def covariance_of(result: CalibrationResult, kind: str, known: np.ndarray, *,
         kept = together(result)
         cover = None if kept is None else kept.of_plate(kind, known)
         return u**2 if cover is None else cover
-    if kind in result.extra.get(COVARIANCE, {}):
+    if kind in result.kept.covariances:
         return _stored(result, kind, known)
     found = behind(result)
     if found is None or not np.isfinite(u).all():
@@ -89,7 +84,7 @@ def unit_rows(known: np.ndarray) -> np.ndarray:
     return rows.reshape(-1, *known.shape)
 
 
-def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def kept_covariances(covers: Mapping[str, np.ndarray]) -> Kept:
     """Return covariances of the known values as a result keeps them, those that are not too large.
 
     Parameters
@@ -97,26 +92,19 @@ def kept_covariance(covers: Mapping[str, np.ndarray]) -> dict[str, Any]:
     covers : dict
         ``xy``, Gx, then Gy, m^2, and ``theta``, rad^2 -> covariance (n, n).
     """
-    stored: dict[str, Any] = {}
-    for kind, cover in covers.items():
-        if 0 < len(cover) <= MAX_FULL:
-            scale = float(np.diag(cover).mean())
-            stored[kind] = rounded(cover[np.tril_indices(len(cover))] / scale).tolist()
-            stored[f"scale_{kind}"] = scale
-    return {COVARIANCE: stored} if stored else {}
+    return Kept(covariances={kind: Covariance.of(cover) for kind, cover in covers.items()
+                             if 0 < len(cover) <= MAX_FULL})
 
 
 def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarray:
     """Return the stored covariance of the known values, which are among those of the map."""
     values = result.error_map.of(kind)[0]
     there = np.isfinite(values).all(axis=0)
-    n = len(values) * int(there.sum())
-    lower, scale = (_kept_numbers(result.extra[COVARIANCE], name, shape, COVARIANCE,
-                                 "no covariance of this map", verb="combine")
-                    for name, shape in ((kind, (n * (n + 1) // 2,)), (f"scale_{kind}", ())))
-    full = np.zeros((n, n))
-    full[np.tril_indices(n)] = lower * scale
-    full = full + np.tril(full, -1).T
+    try:
+        full = result.kept.covariances[kind].matrix(len(values) * int(there.sum()))
+    except ValueError as error:
+        raise InputError("map_covariance", "no covariance of this map",
+                         "write the map again with `selfcal combine`") from error
     chosen = np.tile(known[there], len(values))
     return full[np.ix_(chosen, chosen)]
 
@@ -134,7 +122,7 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     Of a large field the contribution of the terms is not kept, and noise alone would be too little.
     """
     unknown = float("nan"), float("nan")
-    if COVARIANCE in result.extra:
+    if result.kept.covariances:
         known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
         cover = covariance_of(result, "xy", known)
         if cover.ndim == 1:
@@ -215,7 +203,8 @@ def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
 def _kept_cells(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
     if not len(images.placing) == len(images.step) == n_views:
-        raise _not_kept("images", "no images of these views")
+        raise InputError("images", "no images of these views",
+                         "write the result again with `selfcal solve`")
     return list(zip(images.placing, images.step, strict=True))
 
 
@@ -235,49 +224,15 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     InputError
         If they are not weights of this field.
     """
-    wrong = "no weights of this field"
-    if not isinstance(kept, list | np.ndarray):
-        weight = _kept_numbers({where: kept}, where, (), where, wrong) * field
-    else:
-        weight = _kept_numbers({where: kept}, where, field.shape, where, wrong)
-    if (weight < 0).any():
-        raise _not_kept(where, wrong)
-    return weight
-
-
-def _kept_numbers(kept: Any, name: str, shape: tuple[int, ...], where: str, wrong: str, *,
-                  verb: str = "solve") -> np.ndarray:
-    """Return numbers that a result keeps under a name.
-
-    Parameters
-    ----------
-    kept : dict
-        What it keeps.
-    name : str
-        Which.
-    shape : tuple of int
-        Their shape; -1 where any number of them may be.
-    where, wrong, verb : str
-        Place, fault and the verb that writes it anew, for the message.
-
-    Raises
-    ------
-    InputError
-        If they are not such numbers.
-    """
+    shape = field.shape if isinstance(kept, list | np.ndarray) else ()
     try:
-        found = np.array(kept[name], dtype=float).reshape(shape)
-    except (TypeError, ValueError, KeyError):
-        found = np.array(np.nan)
-    if not np.isfinite(found).all():
-        raise _not_kept(where, wrong, verb)
-    return found
-
-
-def _not_kept(where: str, wrong: str, verb: str = "solve") -> InputError:
-    """Return the error of a result that does not keep what it should."""
-    return InputError(where, wrong, f"write the {'map' if verb == 'combine' else 'result'} again "
-                      f"with `selfcal {verb}`")
+        weight = np.array(kept, dtype=float).reshape(shape) * (field if shape == () else 1.0)
+    except (TypeError, ValueError):
+        weight = np.array(np.nan)
+    if not (np.isfinite(weight) & (weight >= 0)).all():
+        raise InputError(where, "no weights of this field",
+                         "write the result again with `selfcal solve`")
+    return weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.angular import MAX_FULL, ROUNDED
+from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import (
     MAX_NODES,
     UNASKED_SITES,
@@ -60,7 +60,7 @@ from selfcal_ros.estimation.terms.equations import (
 )
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
-from selfcal_ros.model.kept import Factors, ImagesKept, Kept
+from selfcal_ros.model.kept import Factors, ImagesKept, Kept, rounded
 from selfcal_ros.model.readings import (
     GridVisits,
     Measurements,
@@ -203,9 +203,6 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 """Coefficients of a microscope in their order."""
 
-DIGITS = 7
-"""Digits of a factor stored."""
-
 
 def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
                 beside: dict[str, np.ndarray] | None = None) -> Factors | None:
@@ -250,17 +247,6 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         name: rounded(part.reshape(len(part), *values.shape[1:]))
         for (name, values), part in zip(beside.items(), np.split(all_of, ends, axis=1),
                                         strict=True)})
-
-
-def rounded(values: np.ndarray) -> np.ndarray:
-    """Return values rounded to `DIGITS` digits, none smaller than `ROUNDED`.
-
-    As quotients of an exact power of ten, so that they print with no more digits.
-    """
-    size = np.abs(values)
-    digits = DIGITS - 1 - np.floor(np.log10(np.maximum(size, ROUNDED)))
-    power = 10.0 ** np.maximum(digits, 0.0)
-    return np.where(size < ROUNDED, 0.0, np.round(values * power) / power)
 
 
 def factors_of(result: CalibrationResult) -> Factors:

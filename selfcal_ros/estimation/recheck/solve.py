@@ -12,7 +12,7 @@ import numpy as np
 
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariance, share_of
+from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariances, share_of
 from selfcal_ros.estimation.comparison.maps import joint_dof, of_square
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
@@ -193,7 +193,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         views_of(measurements, problem, solution.parameters),
         Observability(unknowns, unknowns, 0, True), noise, measurements.all_rejected(),
         findings=() if failed else changes,
-        sense=str(measurements.sense), extra=kept_covariance(covers),
+        sense=str(measurements.sense), kept=kept_covariances(covers),
         run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
                         enlarged_by=plate.result.verdict.enlarged_by),

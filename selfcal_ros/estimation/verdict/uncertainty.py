@@ -14,10 +14,11 @@ import numpy as np
 
 from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.estimation.joint.problem import F_LEVEL, coverage_factor
-from selfcal_ros.estimation.joint.solve import factors_of, rounded, variance_of_terms
+from selfcal_ros.estimation.joint.solve import factors_of, variance_of_terms
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.options import OWED
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
+from selfcal_ros.model.kept import rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES

@@ -25,6 +25,7 @@ from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
+from selfcal_ros.model.kept import Covariance, Kept
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -185,7 +186,7 @@ def test_the_mean_keeps_its_covariance_in_its_file():
     np.testing.assert_allclose(angular, found.theta.covariance, atol=1e-6 * angular.max())
     a, b = StageMap(read).length_uncertainty()
     assert 0 < a < 1e-6 and b >= 0
-    damaged = replace(read, extra=read.extra | {"map_covariance": {"xy": [1.0], "scale_xy": 1.0}})
+    damaged = replace(read, kept=Kept(covariances={"xy": Covariance(np.ones(1), 1.0)}))
     with pytest.raises(InputError, match="no covariance of this map"):
         covariance_of(damaged, "xy", known)
 
@@ -251,7 +252,7 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     found = combine([part("a", A), Part("b", other)])
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
     np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
-    assert "xy" not in found.result.extra.get("map_covariance", {})
+    assert "xy" not in found.result.kept.covariances
     assert covariance_of(found.result, "xy", found.known).ndim == 1
 
 
@@ -322,7 +323,7 @@ def test_large_fields_are_combined_by_their_variances():
                     u_gy=u) for _ in range(3)]
     found = combine([Part(name, emap, replace(result_of(emap), input={}))
                      for name, emap in zip("abc", maps, strict=True)])
-    assert found.xy.covariance.ndim == 1 and "map_covariance" not in found.result.extra
+    assert found.xy.covariance.ndim == 1 and not found.result.kept.covariances
     emap = found.result.error_map
     np.testing.assert_allclose(emap.u_gx, 3e-9 / np.sqrt(3), rtol=0.05)
     assert all(not run.test.correlated and not run.test.significant
