@@ -45,10 +45,17 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         self.subscribe(names.DETECTIONS, self.session.take_detection)
         for node in OF_A_CELL:
             self.subscribe(names.of_node(node, names.HEALTH), partial(self._take_health, node))
+        self.subscribe(names.DIAGNOSTICS, self._take_diagnostics)
         self.every(0.02, self._tick)
 
     def _take_health(self, node: str, message: Any) -> None:
         self.session.take_health(node, message.level[0], message.message)
+
+    def _take_diagnostics(self, message: Any) -> None:
+        own = self.get_fully_qualified_name().lstrip("/")
+        for status in message.status:
+            if status.name != own:
+                self.session.take_diagnosis(status.name, status.level[0], status.message)
 
     def _tick(self) -> None:
         if self.finished.done():

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -67,6 +67,9 @@ CORRECTED = Topic(topics.CORRECTED_TOPIC, JointState, _qos(100, reliable=False))
 MOTION = Topic(topics.MOTION_TOPIC, JointState, _qos(1000))
 """Commanded positions of the stage: each counts, none is displaced by newer ones."""
 CORRECTED_MOTION = Topic(topics.CORRECTED_MOTION_TOPIC, JointState, _qos(1000))
+
+DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, _qos(100, reliable=False))
+"""Of all nodes, of other packages too."""
 
 # below the node's own name (~/)
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))

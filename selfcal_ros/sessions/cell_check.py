@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from selfcal_ros.collection.inputs import (
     Reason,
 )
 from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import printable
 from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
@@ -42,6 +44,8 @@ CLEARLY, LEAST_TURN_RAD = 0.1, 2e-4
 turn for which this is not chance."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
+MOST_NAMED = 5
+"""Nodes in error that are named."""
 REVISIT_S = 10.0
 """Time within which a cell must revisit a missing mark."""
 OLDEST_S = 10.0
@@ -133,9 +137,10 @@ class CellCheck:
         self._seen: list[tuple[float, int, bool]] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
         self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
+        self._foreign: dict[str, str] = {}  # ERRORs on /diagnostics, by the names of their statuses
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
-        self._script = self._run()
+        self._script = self._run_and_diagnosed()
         self.publishers: dict[str, list[str]] = {}  # topic -> nodes that publish on it
         self._events: list[EncoderSample | Detection] = []  # of the measured view
 
@@ -161,10 +166,27 @@ class CellCheck:
         if level >= Level.ERROR:
             self._errors[node] = line
 
+    def take_diagnosis(self, name: str, level: int, line: str) -> None:
+        """Take a status of /diagnostics, of whichever node; a later one of a name replaces it."""
+        self._foreign.pop(name, None)
+        if level == Level.ERROR:
+            self._foreign[name] = line
+
     def tick(self) -> None:
         """Perform due work."""
         if not self.done:
             self.done = next(self._script, self) is self
+
+    def _run_and_diagnosed(self) -> Steps[None]:
+        """Check the cell, then tell which nodes are in error at the end."""
+        yield from self._run()
+        if self._foreign:
+            named = [f"{printable(name)}: {printable(line)}"
+                     for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)]
+            more = len(self._foreign) - len(named)
+            self._tell("diagnostics", False, "ERROR on /diagnostics: " + "; ".join(named)
+                       + f"; and {more} more" * (more > 0),
+                       "correct what these nodes say, or end them if they are not of this machine")
 
     def _run(self) -> Steps[None]:
         if not (yield from self._until(lambda: self._samples, self._patience_s)):

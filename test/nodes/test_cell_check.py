@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rosgraph_msgs.msg import Clock
 
 from selfcal_ros.cli import cell
@@ -121,6 +122,18 @@ def checked(graph, fault="", checker=(), plan=None, **cell):
 
 def failed(items):
     return {name for name, item in items.items() if not item.passed}
+
+
+@pytest.mark.usefixtures("short")
+def test_a_node_of_another_package_in_error_is_heard(graph):
+    """Published again and again, as the checker may not have been found yet."""
+    publisher = graph.hand.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    hot = DiagnosticStatus(name="motor x", level=DiagnosticStatus.ERROR, message="too hot")
+    graph.hand.create_timer(0.1, lambda: publisher.publish(DiagnosticArray(status=[hot])))
+    node, items = checked(graph)
+    assert failed(items) == {"diagnostics"}, items
+    assert items["diagnostics"].figure == "ERROR on /diagnostics: motor x: too hot"
+    assert node.exit_code == ExitCode.NOT_QUALIFIED
 
 
 @pytest.mark.usefixtures("short")

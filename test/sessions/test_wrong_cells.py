@@ -133,12 +133,14 @@ FIELDS = {"m": 0, "n": 0, "k": 0, "offset_x": 0.0, "offset_y": 0.0, "offset_thet
           "sigma": 0.0}
 
 
-def checked(fault="", **cell):
-    """Return the items of a check of a cell."""
+def checked(fault="", statuses=(), **cell):
+    """Return the items of a check of a cell, beside nodes with these statuses."""
     hands = Hands()
     bench = Cell(fault, hands, **cell)
     check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
                                     hands.ports, settle_s=0.2, patience_s=30.0)
+    for status in statuses:
+        check.take_diagnosis(*status)
     while not check.done:
         hands.published.clear()
         check.tick()
@@ -212,6 +214,19 @@ def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
     assert check.items[-1] == CheckItem(
         "commands", False, "0 detections in 5 s after MEASURE: cell_driver: first move: x is "
         "reversed", "correct turn")
+
+
+HOT = ("motor x", Level.ERROR, "too hot")
+
+
+@pytest.mark.parametrize("statuses, told", [
+    ([HOT], "ERROR on /diagnostics: motor x: too hot"),
+    ([HOT, ("motor x", Level.OK, "cooled")], ""), ([("fan", Level.WARN, "slow")], ""),
+    ([(f"axis {number}", Level.ERROR, "off") for number in range(7)], "axis 4: off; and 2 more")])
+def test_other_nodes_in_error_fail_the_check_of_a_right_cell(statuses, told):
+    failed = [item for item in checked(statuses=statuses) if not item.passed]
+    assert [item.name for item in failed] == ["diagnostics"] * bool(told)
+    assert not told or failed[0].figure.endswith(told)
 
 
 def test_two_publishers_are_the_only_fault():
