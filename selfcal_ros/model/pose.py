@@ -226,6 +226,9 @@ class PlacedPose(StagePose):
         return _placed_rows(self, artifact)
 
 
+AnyPose = LatticePose | PlacedPose
+
+
 @lru_cache(64)
 def _placed_rows(pose: PlacedPose, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
     sites = np.stack(pose.site_of(*artifact.places(artifact.m, artifact.n)))

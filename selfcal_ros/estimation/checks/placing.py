@@ -18,14 +18,14 @@ were named.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import EDGE, LatticePose, PlacedPose, StagePose
+from selfcal_ros.model.pose import EDGE, AnyPose, LatticePose, StagePose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 
 WINDOW = 3
@@ -100,7 +100,7 @@ MIRRORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 class _Seen:
     """Readings of one view in the window: places, complex (n,), pitches, deviations, m, repeats."""
 
-    pose: LatticePose | PlacedPose
+    pose: AnyPose
     place: np.ndarray
     deviation: np.ndarray
     count: np.ndarray
@@ -186,7 +186,7 @@ def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, np.
     return Mirrored(axes, best) if axes else None
 
 
-def _moved(seen: _Seen, planned: Any, pose: Any) -> _Seen:
+def _moved(seen: _Seen, planned: AnyPose, pose: AnyPose) -> _Seen:
     """Return the readings of a cell of images at the pose of their view; the camera stays."""
     if seen.pose == planned:
         return replace(seen, pose=pose)
@@ -202,7 +202,7 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
     yield from (replace(pose, shift=shift) for shift in sorted(beside - {pose.shift}))
 
 
-def _poses(seen: _Seen, artifact: Artifact) -> Iterator[Any]:
+def _poses(seen: _Seen, artifact: Artifact) -> Iterator[AnyPose]:
     """Yield the other poses with which the readings of a view are of marks of the plate."""
     pose = seen.pose
     if isinstance(pose, LatticePose):
@@ -264,7 +264,7 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     inside = np.maximum(np.abs(i), np.abs(j)) <= WINDOW + EDGE
     if inside.sum() < LEAST_READINGS:
         return None
-    return _Seen(cast(LatticePose | PlacedPose, pose), (i + 1j * j)[inside],
+    return _Seen(cast(AnyPose, pose), (i + 1j * j)[inside],
                  (view.dx + 1j * view.dy)[inside], view.count[inside])
 
 

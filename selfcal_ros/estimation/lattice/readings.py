@@ -9,11 +9,9 @@ import numpy as np
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose, PlacedPose
+from selfcal_ros.model.pose import AnyPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.view import View, rotations_of
-
-AnyPose = LatticePose | PlacedPose
 
 
 @lru_cache(maxsize=1024)

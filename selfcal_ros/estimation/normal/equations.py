@@ -24,7 +24,6 @@ from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews
 from selfcal_ros.estimation.lattice.readings import (
     AngularData,
-    AnyPose,
     GridData,
     in_field,
     pose_of,
@@ -40,7 +39,7 @@ from selfcal_ros.estimation.normal.angular import (
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.pose import LatticePose, PlacedPose
+from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
 from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
 TRACE = 1e-6

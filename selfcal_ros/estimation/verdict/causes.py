@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -29,6 +28,7 @@ from selfcal_ros.blocks import AXES, Located, block_of, blocks
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.joint.model_fit import ModelFit, equations_of, squares
 from selfcal_ros.estimation.joint.problem import (
+    Problem,
     fit,
     least_noise_rad,
     noise_excess,
@@ -37,6 +37,7 @@ from selfcal_ros.estimation.joint.problem import (
 from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, Score, TermEquations, score
+from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
@@ -198,7 +199,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
     known = problem.system.known_sites
     there = places.errors(model.found.field)
-    changed = places.changes(_missed(model, model.found.field, there), problem.turn_rad)
+    changed = places.changes(_missed(problem, places, model.found.field, there), problem.turn_rad)
     if not rms(_parts(changed)) > SMALL * rms(u):
         return None
     before, other = model.found.xy.residuals, fit(problem, model.y - changed)
@@ -208,7 +209,7 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     ratio = np.where(known, np.abs(_parts(moved)) / u, 0.0)
     if not (rms(ratio[:, known]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
         return None
-    noise = np.maximum(_noise(model, there, u), FLOOR)
+    noise = np.maximum(_noise(problem, places, there, u), FLOOR)
     effect = np.abs(_parts(moved))
     p = effect.size * math.erfc(float((effect / noise).max()) / math.sqrt(2))
     if p >= CAUSE_LEVEL:
@@ -221,35 +222,36 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
                  rms(ratio[:, known]) < model.found.xy.k)
 
 
-def _missed(model: ModelFit, field: np.ndarray, there: np.ndarray) -> np.ndarray:
+def _missed(problem: Problem, places: StagePlaces, field: np.ndarray,
+            there: np.ndarray) -> np.ndarray:
     """Return the part of a field at the positions of the stage that a solution omits, (P,), m.
 
     Parameters
     ----------
-    model : ModelFit
-        The solution.
+    problem : Problem
+        What was solved.
+    places : StagePlaces
+        The positions of the stage.
     field : complex array (nx, ny)
         Stage error at the sites, m.
     there : complex array (P,)
         Stage error of the solution at the positions of the stage.
     """
-    places: Any = model.problem.places
     smooth = places.moved(field, there)
-    return ROUGH * (places.moved(field, there, local=True) - smooth) if model.problem.moves \
-        else smooth
+    return ROUGH * (places.moved(field, there, local=True) - smooth) if problem.moves else smooth
 
 
-def _noise(model: ModelFit, there: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _noise(problem: Problem, places: StagePlaces, there: np.ndarray,
+           u: np.ndarray) -> np.ndarray:
     """Return the standard deviation of `_missed` at each site for noise u of the nodes, m.
 
     Both (2, nx, ny).
     """
-    places: Any = model.problem.places
     rng, at = np.random.default_rng(0), places.site
     total, n_sites = np.zeros((2, u[0].size)), u[0].size
     for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
-        missed = _missed(model, drawn[0] + 1j * drawn[1], there)
+        missed = _missed(problem, places, drawn[0] + 1j * drawn[1], there)
         total += [np.bincount(at, part**2, n_sites) for part in _parts(missed)]
     return np.sqrt(total / (FEW_DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))
                    ).reshape(u.shape)
