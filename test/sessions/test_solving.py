@@ -179,7 +179,7 @@ def test_readings_of_two_runs_are_never_mixed(desk):
     (PlanRun("a", "2"), PlanRun("a", "1"), True), (PlanRun("a", "1"), PlanRun("a", "2"), False),
     (PlanRun("a", "10"), PlanRun("a", "9"), True), (PlanRun("b", "1"), PlanRun("a", "2"), False),
     (PlanRun("b"), PlanRun("a", "2"), False), (PlanRun("a", "2"), PlanRun("a"), True),
-    (PlanRun("b"), PlanRun("a"), True),
+    (PlanRun("b"), PlanRun("a"), True), (PlanRun("b", "2"), PlanRun("a", "2"), False),
     (PlanRun("a", "x"), PlanRun("a", "2"), False),
     (PlanRun("a", "9" * 21), PlanRun("a", "2"), False),
     (PlanRun("a", "2"), PlanRun("a", "9" * 21), True),

@@ -309,14 +309,16 @@ def test_readings_of_other_days_are_refused(first, last, good):
     assert "3 years behind" in " ".join(said.itertext())
 
 
-@pytest.mark.parametrize(("reference", "name", "value", "good"), [
-    (CERTIFIED, "temperature of the plate", 20.55, True),  # 2 u of both: 0.22 K
-    (CERTIFIED, "temperature of the plate", 20.7, False),
-    (CERTIFIED, "temperature of the air", 23.0, True),
-    (replace(CERTIFIED, kind="stage_x"), "temperature of the plate", 20.7, True)])
-def test_a_plate_at_another_temperature_than_its_length_is_refused(reference, name, value, good):
+@pytest.mark.parametrize(("reference", "name", "u", "value", "good"), [
+    (CERTIFIED, "temperature of the plate", 0.05, 20.55, True),  # 2 u of both: 0.22 K
+    (CERTIFIED, "temperature of the plate", 0.05, 20.7, False),
+    (CERTIFIED, "temperature of the plate", None, 20.7, False),
+    (CERTIFIED, "temperature of the air", 0.05, 23.0, True),
+    (replace(CERTIFIED, kind="stage_x"), "temperature of the plate", 0.05, 20.7, True)])
+def test_a_plate_at_another_temperature_than_its_length_is_refused(reference, name, u, value, good):
     result = solved(reference.at_temperature("20.4:.1:5e-7:5e-8"))
-    given = {**details(), "conditions": [{"name": name, "value": value, "u": 0.05, "unit": "degC"}]}
+    stated = {"name": name, "value": value, "unit": "degC"} | ({} if u is None else {"u": u})
+    given = {**details(), "conditions": [stated]}
     if good:
         assert certificate(result, given)
         return

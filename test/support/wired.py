@@ -45,7 +45,8 @@ def calibrated(truth, rng):
 def machine(seed, wiring):
     """Return the calibrations before and after of a machine with another plate each time.
 
-    `wiring`: "right", or one of `WRONG`; with "exchanged" and "unit" the seed chooses which.
+    `wiring`: "right", or one of `WRONG`; with "exchanged" and "unit" the seed chooses which. Or
+    what the controller makes of the table (2, 7, 7).
     """
     rng = np.random.default_rng(seed)
     first = replace(random_truth(ARTIFACT, 4, rng), g=smooth_error(rng), g_theta=smooth_angle(rng))
@@ -53,7 +54,9 @@ def machine(seed, wiring):
     table = np.stack([before.error_map.gx, before.error_map.gy])
     angle = before.error_map.g_theta
     factor = 1.0
-    if wiring == "sign":
+    if callable(wiring):
+        table = wiring(table)
+    elif wiring == "sign":
         factor = -1.0
     elif wiring == "off":
         factor = 0.0

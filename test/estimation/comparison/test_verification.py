@@ -3,7 +3,7 @@
 
 import pytest
 
-from selfcal_ros.estimation.comparison.verification import verify
+from selfcal_ros.estimation.comparison.verification import TableFault, verify
 from selfcal_ros.reporting.words.verification import verification_sentence
 from test.support.wired import WRONG, machine
 
@@ -25,3 +25,16 @@ def test_the_sentence_names_what_acts(wiring):
         if wiring in ("right", "sign", "unit", "off"):
             for axis in found.axes.values():
                 assert abs(axis.factor - factor) < 5 * axis.u_factor
+
+
+@pytest.mark.parametrize(("fault", "loaded"), [
+    (TableFault.COMPONENTS, lambda table: table[::-1]),
+    (TableFault.PLACES, lambda table: table.transpose(0, 2, 1)),
+    (TableFault.TRANSPOSED, lambda table: table.transpose(0, 2, 1)[::-1]),
+    (TableFault.MIRRORED_X, lambda table: table[:, ::-1]),
+    (TableFault.MIRRORED_Y, lambda table: table[:, :, ::-1]),
+    (TableFault.MIRRORED, lambda table: table[:, ::-1, ::-1])])
+def test_each_arrangement_of_a_table_is_named(fault, loaded):
+    before, after, _ = machine(101, loaded)
+    found = verify(before, after)
+    assert found.fault is fault and not found.passed

@@ -65,3 +65,18 @@ def test_several_fields_are_gathered_at_once():
     together = views.gather(fields)
     assert together.shape == (3, 6, 7, 7)
     assert together[1] == pytest.approx(views.gather(fields[1]))
+
+
+def test_a_mark_is_near_known_nodes_only_if_all_corners_of_its_cell_are():
+    views = views_of(plate(9, 5, "bilinear"), [(20.0, (0.3, -0.2))])
+    x, y = np.stack(views.from_corner).reshape(2, -1)
+    inside = (x % 1 > 0.01) & (x % 1 < 0.99) & (y % 1 > 0.01) & (y % 1 < 0.99)
+    inside &= (x > 0) & (x < 4) & (y > 0) & (y < 4)
+    assert inside.sum() > 20
+    for i in range(5):
+        for j in range(5):
+            nodes = np.ones((5, 5), dtype=bool)
+            nodes[i, j] = False
+            beside = (np.abs(x - i) < 1) & (np.abs(y - j) < 1)
+            found = views.near(nodes).ravel()
+            np.testing.assert_array_equal(found[inside], ~beside[inside])
