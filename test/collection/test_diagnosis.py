@@ -2,11 +2,12 @@
 """What spoilt most detections is named, with numbers and what to set, each cause by itself."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.diagnosis import Evidence, diagnose, main_reason
+from selfcal_ros.collection.diagnosis import Evidence, _stopped, diagnose, main_reason
 from selfcal_ros.collection.inputs import REMEDY, Reason, rejections
 from selfcal_ros.collection.marks.seen_poses import NamedMarks, _fitted
 from selfcal_ros.model.artifact import Artifact
@@ -345,6 +346,15 @@ def declared(cell, *size):
         c, artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]))
         for c in cell.commands]
     return [*commands, *cell.samples, *cell.detections]
+
+
+def test_a_mark_that_is_read_many_times_is_not_a_stage_that_has_stopped():
+    places = np.array([0j] * 5 + [3 + 1j] * 20)
+    marks = SimpleNamespace(stage=places, sites=places)
+    seen = SimpleNamespace(marks=[marks], pitch_m=0.01, sense=Sense.MICROSCOPE_MOVES)
+    assert _stopped(seen) is None
+    marks.sites = places + np.linspace(0, 2, 25)
+    assert "the stage has stopped: it is indicated at x = 0.03 m, y = 0.01 m" in _stopped(seen)
 
 
 def test_an_encoder_that_stands_still_in_the_middle_of_a_small_plate():
