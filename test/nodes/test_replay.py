@@ -385,6 +385,23 @@ def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
         "2 of 2 detection messages received; play in a ROS domain of its own\n")
 
 
+def test_nothing_is_played_before_the_nodes_listen(graph):
+    deaf, steps, turns = ["encoder"], [], []
+    player = SimpleNamespace(
+        listener="/measurement_collector", unheard=lambda: turns.append(1) or deaf, detector="",
+        unseen=list, done=True, step=lambda: steps.append(1), played=5, total=5, arrived=False,
+        alone_on=[], is_alone=lambda: True, overheard=True, taken=None, sent={}, heard={},
+        playlist=SimpleNamespace(lost=[]))
+    graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
+    graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
+    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    graph.until(lambda: len(turns) > 20, "the session to wait for the nodes")
+    assert not steps
+    deaf.clear()
+    graph.until(session.finished.done, "the end of the session")
+    assert steps
+
+
 @pytest.mark.parametrize("options, problem", [
     (["--domain", "233"], "--domain: 233 is not a ROS domain; give a number from 0 to 232"),
     (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
