@@ -244,19 +244,6 @@ def csv_cells(line: str, where: str) -> list[str]:
     return cells
 
 
-def number_of(text: str) -> float:
-    """Return the number that a text is.
-
-    Raises
-    ------
-    ValueError
-        If it is none, also for 1_000 and for digits of other scripts, which float() reads.
-    """
-    if not text.isascii() or "_" in text:
-        raise ValueError(f"not a plain number: {text!r}")
-    return float(text)
-
-
 def read_json(path: str | os.PathLike, limit: int | None = None) -> Any:
     """Return the JSON value in `path`; InputError names line and column of a fault.
 

@@ -10,7 +10,8 @@ import pytest
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
 BASE = {"blocks": {"errors"}, "errors": set(), "topics": set(), "units": set(),
-        "portable": set(), "start": {"portable", "topics"}, "outputs": {"errors", "portable"},
+        "plain_numbers": set(), "portable": set(), "start": {"portable", "topics"},
+        "outputs": {"errors", "portable"},
         "files": {"errors", "outputs", "portable"},
         "results": {"errors", "files", "model"}}
 """Modules that any package may import (`start`: the edges), and what they import."""

@@ -11,9 +11,10 @@ from selfcal_ros.cli.deliver import deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import csv_cells, number_of, read_text
+from selfcal_ros.files import csv_cells, read_text
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.outputs import check_outputs
+from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 FAR = 10.0

@@ -31,7 +31,7 @@ from selfcal_ros.estimation.observability.suggest import (
     score_plan,
 )
 from selfcal_ros.estimation.terms.planned import Assumed
-from selfcal_ros.files import number_of, write_yaml
+from selfcal_ros.files import write_yaml
 from selfcal_ros.machine.cell import PLACERS, SHIPPED
 from selfcal_ros.machine.visiting import stops
 from selfcal_ros.model.artifact import Artifact
@@ -42,6 +42,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
 from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.observability import describe_view, worded_observability
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 

@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.files import csv_cells, number_of, read_text
+from selfcal_ros.files import csv_cells, read_text
 from selfcal_ros.laser import data as laser_data
 from selfcal_ros.laser.profiles import name_of
 from selfcal_ros.outputs import write_text
+from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.units import M_PER_MM
 
 BLOCK = "block"

@@ -8,7 +8,8 @@ from functools import cache
 
 from selfcal_ros.blocks import Block, block_of, blocks
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.files import checked_fields, number_of
+from selfcal_ros.files import checked_fields
+from selfcal_ros.plain_numbers import number_of
 
 MAX_DRIFT_DEGREE = 9
 """Largest degree of the polynomial of a view's drift."""

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import csv_cells, number_of
+from selfcal_ros.files import csv_cells
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.plain_numbers import number_of
 
 OFF_SITE = 0.01
 """Largest distance of a position in a table from its site, in pitches (of a line, in spacings)."""
