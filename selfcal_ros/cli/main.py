@@ -37,6 +37,7 @@ from selfcal_ros.errors import (
     did_you_mean,
     printable,
 )
+from selfcal_ros.plain_numbers import number_of, whole_number_of
 from selfcal_ros.portable import hold_interrupts, say_no_more
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
@@ -182,6 +183,8 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.set_defaults(leaf=self)
+        self.register("type", float, number_of)  # float() reads 1_0 as 10, and other digits
+        self.register("type", int, whole_number_of)
 
     def format_help(self) -> str:
         """Return the help, with the example as it is typed."""

@@ -46,6 +46,7 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.papers.methods import calibrate_by
+from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import told
 from selfcal_ros.reporting.words.phrases import recheck_lines
@@ -158,7 +159,8 @@ def _reference(text: str | None) -> dict[str, Any]:
         return {"reference_kind": kind, "reference_marks": rest}
     try:
         error, u = rest.split(":")
-        return {"reference_kind": kind, "reference_error": float(error), "reference_u": float(u)}
+        return {"reference_kind": kind, "reference_error": number_of(error),
+                "reference_u": number_of(u)}
     except ValueError as error:
         raise InputError("--reference", f"{text!r} is not KIND:ERROR:U",
                          "write e.g. artifact:1.2e-6:3e-7, or marks:-5,0:5,0:0.1000002:5e-9"

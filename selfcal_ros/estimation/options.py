@@ -12,6 +12,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm, default_terms
+from selfcal_ros.plain_numbers import number_of, whole_number_of
 
 MISALIGNMENT_MODELS = ("linear", "rigid")
 OWED = 0.1
@@ -19,6 +20,9 @@ OWED = 0.1
 
 MAX_EXPANSION_PER_K = 1e-3
 """Coefficient of linear expansion above that of any solid, 1/K."""
+LEAST_EXPANSION_PER_K = -2e-6
+"""Coefficient below those of what plates and scales are made of, 1/K: carbon fibre has -1e-6,
+glass ceramics -0.1e-6. A smaller one is a lost sign."""
 
 
 class ReferenceKind(StrEnum):
@@ -97,9 +101,9 @@ class ReferenceLength:
         try:
             first, second, *numbers = text.split(":")
             more = ",0" * (artifact.marks is not None)
-            marks = tuple((int(m), int(n)) for m, n in (
+            marks = tuple((whole_number_of(m), whole_number_of(n)) for m, n in (
                 (name + more * ("," not in name)).split(",") for name in (first, second)))
-            length, u = map(float, numbers)
+            length, u = map(number_of, numbers)
         except ValueError as error:
             raise InputError(where, f"'{text}' is not {form}:LENGTH:U", example) from error
         for mark in marks:
@@ -148,13 +152,13 @@ class ReferenceLength:
         names = ("temperature_c", "u_temperature_k", "expansion_per_k", "u_expansion_per_k",
                  "certified_at_c")
         try:
-            numbers = [*map(float, text.split(":"))]
+            numbers = [*map(number_of, text.split(":"))]
         except ValueError:
             numbers = []
         known = dict(zip(names, [*numbers, 20.0], strict=False))
         if len(numbers) not in (4, 5) or not all(map(math.isfinite, numbers)) or min(
-                known["u_temperature_k"], known["u_expansion_per_k"]) < 0 or abs(
-                known["expansion_per_k"]) > MAX_EXPANSION_PER_K:
+                known["u_temperature_k"], known["u_expansion_per_k"]) < 0 or not (
+                LEAST_EXPANSION_PER_K <= known["expansion_per_k"] <= MAX_EXPANSION_PER_K):
             raise InputError("reference length", f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
                              "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)")
         for name in ("temperature_c", "certified_at_c"):

@@ -119,6 +119,15 @@ def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
     one_line(err, "bad.cal: the tables make the machine worse; check signs")
 
 
+@pytest.mark.parametrize("option, text", [
+    ("--home-x", "5_0"), ("--home-x", "٥"), ("--x-axis", "1_1"), ("--x-axis", "٣")])
+def test_an_option_is_a_plain_number(run, option, text):
+    """Python's float() and int() read 5_0 as 50 and the digits of every script."""
+    code, _, err = run("export", "r.json", "-o", "f.cal", option, text)
+    assert code == 2
+    one_line(err, f"{option}: ", "is not a ")
+
+
 def without_last_row(text: str) -> str:
     *rows, _, end = text.splitlines(keepends=True)
     return "".join([*rows, end])

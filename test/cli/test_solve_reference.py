@@ -63,7 +63,9 @@ def test_a_certificate_of_nothing_is_refused(capsys):
 
 
 @pytest.mark.parametrize("text", ["artifact", "artifact:x:1", "moon:1e-6:1e-7", "artifact:1:0",
-                                  "marks", "marks:0,0:0,0:1e-3:0", "marks:-6,0:5,0:0.11:0"])
+                                  "artifact:2_0e-7:1e-7", "marks:-0_5,0:5,0:0.1:0",
+                                  "marks:-5,0:5,0:0.1_0:0", "marks", "marks:0,0:0,0:1e-3:0",
+                                  "marks:-6,0:5,0:0.11:0"])
 def test_a_bad_reference_is_one_line(capsys, text):
     assert main(["solve", BAG, "--reference", text]) == 2
     err = capsys.readouterr().err

@@ -28,10 +28,17 @@ def test_a_certificate_of_another_temperature():
 
 
 @pytest.mark.parametrize("text", ["", "20", "20:0:1e-6", "20:0:1e-6:0:20:1", "20:-1:1e-6:0",
-                                  "20:0:1e-6:-1", "x:0:1e-6:0", "nan:0:1e-6:0", "20:0:8:0"])
+                                  "20:0:1e-6:-1", "x:0:1e-6:0", "nan:0:1e-6:0", "20:0:8:0",
+                                  "20:0:-8e-6:0", "2_0:0:1e-6:0", "٢٠:0:1e-6:0"])
 def test_what_is_no_set_of_temperatures_is_refused(text):
     with pytest.raises(InputError, match="is not T:U_T:ALPHA"):
         ReferenceLength("artifact", 0.0).at_temperature(text)
+
+
+@pytest.mark.parametrize("per_k", ["-0.1e-6", "-1e-6", "2.4e-5"])
+def test_glass_ceramics_and_carbon_fibre_may_shrink(per_k):
+    found = ReferenceLength("artifact", 0.0).at_temperature(f"21:0:{per_k}:0")
+    assert found.relative_error == pytest.approx(float(per_k))
 
 
 @pytest.mark.parametrize("text", ["296:0.02:8e-6:0", "20:0.02:8e-6:0:293.15", "-51:0:0:0"])
