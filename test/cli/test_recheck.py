@@ -70,6 +70,7 @@ def test_a_stage_that_has_changed(folder, capsys):
                  "--report", str(folder / "bent.html")]) == 0
     text = capsys.readouterr().out
     assert text.startswith("Changed since r.json: calibrate again, provided this is the same ")
+    assert "and the camera was not touched (if it was, declare it: --microscope 0.01); " in text
     data = read_json(out)
     assert data["recheck"]["changed"] is True and data["recheck"]["p"] < 1e-3
     assert data["warnings"][0].startswith("Changed since r.json")

@@ -134,7 +134,8 @@ def _since(where: str) -> str:
 
 def _changed(since: str, clearest: str, p: float) -> str:
     return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
-            f"clean and placed as planned; {clearest} (p = {p:.2g})")
+            "clean and placed as planned, and the camera was not touched (if it was, declare it: "
+            f"--microscope 0.01); {clearest} (p = {p:.2g})")
 
 
 def _scale_changed(since: str, change: float, u: float, p: float) -> str:
