@@ -81,13 +81,14 @@ class TableVerification:
     def unfit(self, error_map: ErrorMap) -> list[Residual]:
         """Return the residuals of tables that are not those of a map, though no worse than none.
 
-        Of a 2D table and of a theta table no more than U of the map (k = 2) may remain, or
-        `LEFT_OF_A_MAP` of its error.
+        Of a 2D table and of a theta table no more than U of the map (k = 2) may remain, rms, and
+        at no place more than twice U, or `LEFT_OF_A_MAP` of the error.
         """
         pairs = ((self.sites if self.in_two_axes else None, (error_map.u_gx, error_map.u_gy)),
                  (self.lines, (error_map.u_g_theta,)))
-        return [residual for residual, u in pairs if residual is not None and residual.rms("after")
-                > max(LEFT_OF_A_MAP * residual.rms("before"), 2 * _rms_of(u))]
+        return [residual for residual, u in pairs if residual is not None and any(
+            size("after") > max(LEFT_OF_A_MAP * size("before"), limit * _rms_of(u))
+            for size, limit in ((residual.rms, 2), (residual.largest, 4)))]
 
 
 def _rms_of(u: Sequence[np.ndarray]) -> float:

@@ -302,10 +302,12 @@ def _verify(args: argparse.Namespace) -> int:
                          "check signs, axes, unit, home position and encoder directions")
     unfit = found.unfit(result.error_map)
     for residual in unfit:
-        print(f"{args.leaf.prog}: {cal.where}: the tables leave "
-              f"{residual.rms('after') / residual.rms('before'):.0%} of the error at the "
-              f"{residual.place}, more than the U of the map: they are not those of this map; "
-              "check offset, unit and number of rows, or export them again", file=sys.stderr)
+        left, most = (size("after") / size("before")
+                      for size in (residual.rms, residual.largest))
+        print(f"{args.leaf.prog}: {cal.where}: the tables leave {left:.0%} of the error at the "
+              f"{residual.place}, {most:.0%} of the largest, more than the U of the map: they are "
+              "not those of this map; check offset, unit and number of rows, or export them again",
+              file=sys.stderr)
     return int(ExitCode.NOT_QUALIFIED if unfit else ExitCode.DONE)
 
 

@@ -133,7 +133,17 @@ def without_last_row(text: str) -> str:
     return "".join([*rows, end])
 
 
+def with_a_wrong_entry(text: str) -> str:
+    """Return a file with one value of the first row wrong by 0.06 um."""
+    lines = text.splitlines(keepends=True)
+    row = next(number for number, line in enumerate(lines) if line[0] in "-0123456789")
+    first, rest = lines[row].split(" ", 1)
+    lines[row] = f"{float(first) + 0.06:.5f} {rest}"
+    return "".join(lines)
+
+
 @pytest.mark.parametrize("spoil", [
+    with_a_wrong_entry,
     lambda text: text.replace("CORUNIT=PRIMARY/1000", "CORUNIT=PRIMARY/1000000"),
     lambda text: text.replace("OFFSETROW=30", "OFFSETROW=35"),
     lambda text: text.replace("=30\n", "=-30\n"), without_last_row])
