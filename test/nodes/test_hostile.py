@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from selfcal_msgs.action import RunCalibration
 from std_srvs.srv import Trigger
@@ -231,12 +231,16 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
                                 *strange]:
             if f"{space}/{topic.name}" in heard:
                 send(graph, replace(topic, name=f"{space}/{topic.name}"), messages)
+    foreign = DiagnosticStatus(level=b"\2", name="of others", message="as told", values=[
+        KeyValue(key="key", value="1")])
+    send(graph, names.DIAGNOSTICS, (message for _, message in worst(
+        names.DIAGNOSTICS.type(status=[foreign]))))
     everybody_is_well(graph, cell, refused, capfd)
     places = {place for place, _ in refused}
     assert {names.COMMAND.name, names.MEASUREMENT.name, names.ERROR_MAP.name} <= places
     assert any("longer than 8192 bytes" in str(error) for _, error in refused)
     sent = {f"{space}/{topic.name}" for space in ("", "/beside", "/replay")
-            for topic, _ in [*good, *private, *strange]}
+            for topic, _ in [*good, *private, *strange]} | {names.DIAGNOSTICS.name}
     only_recorded = {f"/{names.CORRECTED.name}"}  # the recorder looks into no message
     assert heard - only_recorded <= sent
     assert {f"/{topic.name}" for topic, _ in [*good, *private]} <= heard
