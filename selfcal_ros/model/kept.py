@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a result keeps beside its maps, so that their covariances follow from its file alone."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class Covariance:
     @classmethod
     def of(cls, matrix: np.ndarray) -> "Covariance":
         """Return that of a matrix (n, n), rounded."""
-        scale = float(np.diag(matrix).mean())
+        scale = float(np.diag(matrix).mean()) or 1.0  # of readings without noise
         return cls(rounded(matrix[np.tril_indices(len(matrix))] / scale), scale)
 
     def matrix(self, n: int) -> np.ndarray:
@@ -178,12 +179,14 @@ def kept_from_dict(data: Mapping[str, Any], of_map: tuple[int, ...],
         If it is damaged.
     """
     images = read(ImagesKept | None, data.get(IMAGES))
+    if images is not None and math.isnan(images.dof_mark):  # JSON has no infinity
+        images = replace(images, dof_mark=math.inf)
     if images is not None and not (0 <= images.share <= 1 and images.dof_mark >= 0 and all(
             len(step) == 2 for step in images.step)):
         raise ValueError(f"{IMAGES}: no noise of images")
     return Kept(
         _factors(data[FACTORS], of_map, of_plate, lines) if FACTORS in data else None,
-        {name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines")
+        {name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines", finite=False)
          for name, u in read(dict, data.get(ANGULAR, {})).items()},
         _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None, images,
         {kind: Covariance(_numbers(stored[kind], (-1,), COVARIANCE, "not a triangle of numbers"),
@@ -209,12 +212,13 @@ def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...],
         on_plate, (2, *of_plate), FACTORS, "no effects on the plate"))
 
 
-def _numbers(value: Any, shape: tuple[int, ...], where: str, wrong: str) -> np.ndarray:
-    """Return finite numbers of a shape; ValueError says where they are wrong, and what is."""
+def _numbers(value: Any, shape: tuple[int, ...], where: str, wrong: str, *,
+             finite: bool = True) -> np.ndarray:
+    """Return numbers of a shape; ValueError says where they are wrong, and what is."""
     try:
         found = read(np.ndarray, value).reshape(shape)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {wrong}") from error
-    if not np.isfinite(found).all():
+    if finite and not np.isfinite(found).all():
         raise ValueError(f"{where}: {wrong}")
     return found

@@ -32,6 +32,10 @@ def test_json_keeps_all_of_it_to_the_last_bit():
                                np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18, rtol=1e-6)
 
 
+def test_a_covariance_without_noise_is_kept():
+    np.testing.assert_array_equal(Covariance.of(np.zeros((2, 2))).matrix(2), np.zeros((2, 2)))
+
+
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_a_covariance_of_another_number_of_values_is_refused(n):
     with pytest.raises(ValueError, match="reshape"):
@@ -45,6 +49,16 @@ def test_nothing_is_kept_of_nothing():
     assert not found.angular
 
 
+def test_what_is_infinite_or_unknown_is_kept():
+    """Marks without noise of their own, as in images without noise; lines without a map."""
+    images = ImagesKept(1.0, np.inf, (0,), ((0, 0),))
+    kept = Kept(angular={"drift": np.full(LINES, np.nan)}, images=images)
+    found = kept_from_dict(json.loads(json.dumps(kept.to_dict(), allow_nan=False)), MAP, PLATE,
+                           LINES)
+    assert found.images == images
+    assert np.isnan(found.angular["drift"]).all()
+
+
 @pytest.mark.parametrize(("where", "value", "message"), [
     (("covariance_terms", "factors"), [[[1.0, 2.0]]], "covariance_terms: no factors of this latt"),
     (("covariance_terms", "factors"), "no", "covariance_terms: no factors of this lattice"),
@@ -53,7 +67,7 @@ def test_nothing_is_kept_of_nothing():
     (("covariance_terms", "beside", "lines"), None, "None is not of type list"),
     (("covariance_terms", "effects_on_plate"), [[None]], "covariance_terms: no effects on the pl"),
     (("angular_terms", "drift"), [0.1] * (LINES + 1), "angular_terms: no contributions to these"),
-    (("angular_terms", "drift"), [None] * LINES, "angular_terms: no contributions to these lines"),
+    (("angular_terms", "drift"), "no", "angular_terms: no contributions to these lines"),
     (("first_order_added",), [0.1], "first_order_added: not two variances"),
     (("map_covariance", "xy"), [1.0, None], "map_covariance: not a triangle of numbers"),
     (("map_covariance", "scale_xy"), "1", "'1' is not a number"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise that the marks of an image share: estimated, and in U, against dense linear algebra."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -19,9 +20,11 @@ from selfcal_ros.estimation.normal.equations import system_for
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.papers.methods import calibrate_by_law
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings
 from test.support.options import STILL
@@ -309,3 +312,11 @@ def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():
     for u in (found.error_map.u_gx, found.error_map.u_gy, found.artifact_map.u_ax,
               found.artifact_map.u_ay):
         assert (u > 0.2 * MARK).all()
+
+
+def test_a_result_of_marks_without_noise_of_their_own_is_read_again():
+    """Their degrees of freedom are infinite, which JSON has no number for."""
+    found = calibrate(measured(2e-7, 3)[1], ALONE)
+    assert found.kept.images.share == 1 and np.isinf(found.kept.images.dof_mark)
+    data = json.loads(json.dumps(result_to_dict(worded(found)), allow_nan=False))
+    assert result_from_dict(data, "r").kept.images == found.kept.images
