@@ -207,6 +207,9 @@ def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...],
     for name, values in beside.items():
         known[name] = _numbers(values, (len(read(list, values)), *shapes.get(name, (4,))), FACTORS,
                                f"no {name} of this plate")
+    numbers = {len(values) for values in known.values()}
+    if known and (len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))):
+        raise ValueError(f"{FACTORS}: quantities beside the map of other factors")
     on_plate = kept.get("effects_on_plate")
     return Factors(terms, factors, known, with_map, None if on_plate is None else _numbers(
         on_plate, (2, *of_plate), FACTORS, "no effects on the plate"))

@@ -33,7 +33,7 @@ from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.kept import Covariance, Factors, ImagesKept, Kept
+from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import block_of_offsets
@@ -235,6 +235,11 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     return weight
 
 
+def _not_kept(what: str) -> InputError:
+    """Return the error of a result whose factors do not have what belongs to them."""
+    return InputError(FACTORS, f"no {what}", "write the result again with `selfcal solve`")
+
+
 @dataclass(frozen=True, eq=False)
 class Together:
     """The covariances behind a result.
@@ -346,11 +351,16 @@ class Together:
     def _effects_on_plate(self) -> np.ndarray:
         """What they add to the variance of the plate's map, for unit noise, (2, nx, ny)."""
         added = self._kept.on_plate
+        if added is None and len(self._effects):
+            raise _not_kept("effects on the plate")
         return np.zeros((2, *self.marks.shape)) if added is None else added
 
     def _beside(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the factors of a quantity beside the map in this shape, (r, ...)."""
-        return self._kept.beside.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
+        beside = self._kept.beside
+        if beside and name not in beside:
+            raise _not_kept(f"{name} of this plate")
+        return beside.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""

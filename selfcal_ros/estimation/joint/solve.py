@@ -495,8 +495,8 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
                ) -> tuple[ErrorMap, np.ndarray | None, Kept]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
-    `sigma` is the noise of a reading as it counts at each site, m; what is kept is
-    without images. The uncertainty is given if it is `wanted`.
+    `sigma` is the noise of a reading as it counts at each site, m; what is kept has
+    no images yet. The uncertainty is given if it is `wanted`.
     """
     problem, found = model.problem, model.found
     system, length = problem.system, problem.half_width_m

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import together
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.terms import equations
@@ -80,3 +81,18 @@ def test_what_is_not_kept_is_not_known():
     assert together(replace(result, kept=kept)) is None
     assert together(replace(result, views=tuple(
         replace(view, read_grid=None) for view in result.views))) is None
+
+
+@pytest.mark.parametrize(("changed", "message"), [
+    (lambda kept: {"beside": {k: v for k, v in kept.beside.items() if k != "plate"}},
+     "no plate of this plate"),
+    (lambda kept: {"terms": (*kept.terms, "slip"),
+                   "of_map": np.concatenate([kept.of_map, kept.of_map[:1]])},
+     "no effects on the plate")])
+def test_factors_without_what_belongs_to_them_are_refused(changed, message):
+    result, _ = both(measured("oblong", "sized"), "sized",
+                     misalignment_model="linear", at_places=False)
+    factors = replace(result.kept.factors, **changed(result.kept.factors))
+    known = together(replace(result, kept=replace(result.kept, factors=factors)))
+    with pytest.raises(InputError, match=f"covariance_terms: {message}; write the result again"):
+        known.cover(known.sites, known.marks)
