@@ -116,7 +116,7 @@ def _counts(text: str, option: str) -> tuple[int, int]:
 
 
 def _count(text: str, option: str) -> int:
-    if not text.strip().isdecimal():
+    if not (text.isascii() and text.strip().isdecimal()):
         raise InputError(option, f"'{text}' is not a whole number", "give for example 11")
     return int(text)
 

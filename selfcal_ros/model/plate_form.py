@@ -116,7 +116,7 @@ def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
 def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
     """Return the plate with a map of NODES[:INTERPOLATION] over the same field."""
     size, _, interpolation = text.partition(":")
-    if not (size.isdecimal() and int(size) >= 3):
+    if not (size.isascii() and size.isdecimal() and int(size) >= 3):
         raise InputError(where, f"'{text}' is not NODES[:INTERPOLATION]",
                          "give a number of nodes a side from 3 on, e.g. 9:bicubic")
     given = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}

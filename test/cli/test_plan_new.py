@@ -92,6 +92,7 @@ def test_the_cell_of_every_machine_can_be_read(machine):
     ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
     ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
     ([*STAGE, "--marks", "2"], "is not a number from 3"),
+    ([*STAGE, "--marks", "٧"], "'٧' is not a whole number"),
     (["--marks", "5"], "--travel: is missing, and there is nobody to ask"),
     ([*STAGE, "--placing", "dog"], "person, robot")])
 def test_what_cannot_work_is_refused_in_a_line(options, line, capsys):

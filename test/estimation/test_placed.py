@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.errors import NotIdentifiableError
+from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.options import Options
@@ -293,3 +293,9 @@ def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, said):
     result = calibrate(measurements, Options())
     assert ("roughness_untested" in [finding.name for finding in result.findings]) is said
     assert (adequacy_of(fit_joint(measurements, Options())) is None) is said
+
+
+@pytest.mark.parametrize("nodes", ["2", "-7", "7.0", "٧", ""])
+def test_numbers_of_nodes_that_are_none_are_refused(nodes):
+    with pytest.raises(InputError, match="is not NODES"):
+        with_nodes(plate(9, 5, "bilinear"), f"{nodes}:bicubic", "--map")
