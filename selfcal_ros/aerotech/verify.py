@@ -2,16 +2,23 @@
 """Error of a simulated controller before and after loading tables: numbers, figure, chapter."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.aerotech.model import CalFile, Table, Table2D
+from selfcal_ros.aerotech.model import CalFile, Table, Table1D, Table2D
+from selfcal_ros.aerotech.one_axis import LEFT_OF_A_MAP, OneAxisFit, one_axis_fit
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
-from selfcal_ros.compensation.residual import Correction, Residual, plane_residuals, residual_of
+from selfcal_ros.compensation.residual import (
+    Correction,
+    Residual,
+    combined,
+    plane_residuals,
+    residual_of,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.result import CalibrationResult
@@ -21,10 +28,6 @@ from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.summary.numbers import fixed_column, significant
 from selfcal_ros.reporting.summary.sections import Section
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
-
-LEFT_OF_A_MAP = 0.05
-"""Part of the error that a table of the same map may leave: far more than the rounding of its
-digits, and than the error of a stage changes over the shift by the zero bias."""
 
 
 def setup_of(frame: MachineFrame) -> MachineSetup:
@@ -58,14 +61,15 @@ def turned(stage: Compensator, frame: MachineFrame, theta_rad: ArrayLike,
 class TableVerification:
     """Residuals at the sites, between them, and at the angular lines; None if not requested.
 
-    `in_two_axes` states whether one of the tables is 2D: 1D ones correct only part of a map.
+    `one_axis` is what tables of x and y leave if all of them are 1D: they correct only part of a
+    map.
     """
 
     frame: MachineFrame
     sites: Residual | None = None
     between: Residual | None = None
     lines: Residual | None = None
-    in_two_axes: bool = False
+    one_axis: OneAxisFit | None = None
 
     @property
     def residuals(self) -> list[Residual]:
@@ -74,21 +78,38 @@ class TableVerification:
 
     @property
     def worse(self) -> bool:
-        """Whether the tables make the machine worse at its sites or lines."""
+        """Whether the tables make the machine worse at its sites or lines.
+
+        With 1D tables in whatever turn of both axes: a table of squareness turns one of them.
+        """
+        sites = self.sites
+        if sites is not None and self.one_axis is not None:
+            sites = replace(sites, before=_without_turn(sites.position, sites.before),
+                            after=_without_turn(sites.position, sites.after))
         return any(r.rms("after") > (1 + 1e-6) * r.rms("before")
-                   for r in (self.sites, self.lines) if r is not None)
+                   for r in (sites, self.lines) if r is not None)
 
     def unfit(self, error_map: ErrorMap) -> list[Residual]:
         """Return the residuals of tables that are not those of a map, though no worse than none.
 
         Of a 2D table and of a theta table no more than U of the map (k = 2) may remain, rms, and
-        at no place more than twice U, or `LEFT_OF_A_MAP` of the error.
+        at no place more than twice U, or `LEFT_OF_A_MAP` of the error. 1D tables of x and y are
+        judged by `one_axis`.
         """
-        pairs = ((self.sites if self.in_two_axes else None, (error_map.u_gx, error_map.u_gy)),
+        in_two_axes = self.sites if self.one_axis is None else None
+        pairs = ((in_two_axes, (error_map.u_gx, error_map.u_gy)),
                  (self.lines, (error_map.u_g_theta,)))
         return [residual for residual, u in pairs if residual is not None and any(
             size("after") > max(LEFT_OF_A_MAP * size("before"), limit * _rms_of(u))
             for size, limit in ((residual.rms, 2), (residual.largest, 4)))]
+
+
+def _without_turn(position: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return residual vectors (2, P) at positions (2, P) without their least-squares turn."""
+    x, y = position - position.mean(axis=1, keepdims=True)
+    turn = np.stack([-y, x])
+    square = (turn**2).sum()
+    return residual - turn * ((turn * residual).sum() / square if square else 0.0)
 
 
 def _rms_of(u: Sequence[np.ndarray]) -> float:
@@ -118,15 +139,18 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
                              f" from the positions of {list(table.inputs)}",
                              f"name the axes of the stage (now x={frame.x_axis}, "
                              f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})")
-    sites = between = lines = None
+    sites = between = lines = one_axis = None
+    in_one_axis = [table for table in xy if isinstance(table, Table1D)]
     if xy:
         evaluator = CalEvaluator(xy, setup_of(frame))
         sites, *rest = plane_residuals(error_map, frame, plane_correction(evaluator, frame), active)
         between = rest[0] if rest else None
+    if in_one_axis and len(in_one_axis) == len(xy):
+        error = error_map if active is None else combined(error_map, frame, active)
+        one_axis = one_axis_fit(error, in_one_axis, frame, setup_of(frame))
     if theta:
         lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
-    return TableVerification(frame, sites, between, lines,
-                             in_two_axes=any(isinstance(table, Table2D) for table in xy))
+    return TableVerification(frame, sites, between, lines, one_axis)
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:

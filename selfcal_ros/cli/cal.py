@@ -6,13 +6,14 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from selfcal_ros.aerotech import export
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
+from selfcal_ros.aerotech.one_axis import OneAxisFit
 from selfcal_ros.aerotech.read import load_cal, load_cals, parse_cal, read_cal, refuse_errors
 from selfcal_ros.aerotech.rules import Gi4
 from selfcal_ros.aerotech.verify import (
@@ -34,7 +35,7 @@ from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain
 from selfcal_ros.results import read_result
-from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC
+from selfcal_ros.units import M_PER_UM, RAD_PER_ARCSEC, URAD_PER_RAD
 
 SCANNER_BITS = 16
 LEAST_BEND_M = 1e-9
@@ -293,13 +294,29 @@ def _verify(args: argparse.Namespace) -> int:
     frame = cal_lines.frame_of(args, frame_of_file(cal))
     with busy("simulating the controller"):
         found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
-    say(args, residual_text(found.residuals), figures_of(found.residuals))
+    one_axis = found.one_axis
+    text, figures = residual_text(found.residuals), figures_of(found.residuals)
+    if one_axis is not None:
+        text = f"{text}\n{one_axis_text(one_axis)}"
+        figures |= {"one_axis": plain(asdict(one_axis))}
+    say(args, text, figures)
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
         save_picture(controller_figure(found), args.plot)
+    unfit_parts = [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
+    if found.worse and one_axis is not None and not unfit_parts:
+        raise InputError(cal.where, "the tables make the middle line better and the field worse: "
+                         "most of the error depends on both positions",
+                         "write a 2D table (selfcal cal export)")
     if found.worse:
         raise InputError(cal.where, "the tables make the machine worse",
                          "check signs, axes, unit, home position and encoder directions")
+    for part in unfit_parts:
+        print(f"{args.leaf.prog}: {cal.where}: of {part.name}, which 1D tables can correct, the "
+              f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
+              f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
+              "more than the U of the map: they are not those of this map; check sign, offset, "
+              "unit and number of entries, or write them again", file=sys.stderr)
     unfit = found.unfit(result.error_map)
     for residual in unfit:
         left, most = (size("after") / size("before")
@@ -308,7 +325,20 @@ def _verify(args: argparse.Namespace) -> int:
               f"{residual.place}, {most:.0%} of the largest, more than the U of the map: they are "
               "not those of this map; check offset, unit and number of rows, or export them again",
               file=sys.stderr)
-    return int(ExitCode.NOT_QUALIFIED if unfit else ExitCode.DONE)
+    return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)
+
+
+def one_axis_text(fit: OneAxisFit) -> str:
+    """Return what 1D tables leave of the parts that they can correct, and what none can correct."""
+    title = "what 1D tables can correct of it, rms, µm"
+    lines = [f"{title:<48}{'part':>16}{'left':>15}"]
+    lines += [f"{part.name:<48}{part.rms / M_PER_UM:>16.6f}{part.rms_left / M_PER_UM:>15.6f}"
+              for part in fit.parts]
+    lines.append(f"{'no 1D table of these axes corrects':<64}{fit.beyond / M_PER_UM:>15.6f}")
+    if fit.squareness_left:
+        lines.append("  straightness leaves the squareness, "
+                     f"{fit.squareness_left * URAD_PER_RAD:.4g} µrad: selfcal cal orthogonality")
+    return "\n".join(lines)
 
 
 def figures_of(residuals: "list[Residual]") -> dict:

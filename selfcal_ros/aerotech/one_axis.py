@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What 1D tables of x and y leave of the part of a map that depends on one position alone.
+
+A 1D table corrects an axis from the position of one axis. Of a map it can correct the mean over
+the other axis. Tables along the middle line are usual as well. Either is the part that a table is
+judged against; what varies with both positions no 1D table corrects.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from selfcal_ros.aerotech.evaluate import BoundTable1D, CalEvaluator, MachineSetup, bound_1d
+from selfcal_ros.aerotech.export import map_line
+from selfcal_ros.aerotech.model import Table1D
+from selfcal_ros.compensation.export import fill_unknown
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.model.error_map import ErrorMap, rms
+
+LEFT_OF_A_MAP = 0.05
+"""Part of the error that a table of the same map may leave: far more than the rounding of its
+digits, and than the error of a stage changes over the shift by the zero bias."""
+ROUNDED_M = 1e-10
+"""Largest error that is taken for rounding of a table's digits."""
+NONE_OF_IT = 1e-2
+"""A table has no slope, or no shape, if that is a smaller part of the other."""
+SPLINE_NODES = 4
+"""Least number of nodes for a cubic spline."""
+
+Axis = Literal["x", "y"]
+Pair = tuple[Axis, Axis]
+"""Axis whose position selects an entry, and axis that is corrected."""
+
+
+@dataclass(frozen=True)
+class OneAxisPart:
+    """A part of a map that 1D tables can correct, and what is left of it.
+
+    Attributes
+    ----------
+    name : str
+        The part: "x from the position of x", "squareness".
+    rms, largest : float
+        Its size at the nodes, m, without its constant.
+    rms_left, largest_left : float
+        What the tables leave of it, m.
+    u : float
+        Standard uncertainty of the map, rms over its nodes, m.
+    """
+
+    name: str
+    rms: float
+    largest: float
+    rms_left: float
+    largest_left: float
+    u: float
+
+    @property
+    def unfit(self) -> bool:
+        """Whether more is left than U (k = 2, rms; twice U at one node) and 5 % of the part."""
+        return any(left > max(LEFT_OF_A_MAP * size, limit * self.u, ROUNDED_M)
+                   for left, size, limit in ((self.rms_left, self.rms, 2),
+                                             (self.largest_left, self.largest, 4)))
+
+
+@dataclass(frozen=True)
+class OneAxisFit:
+    """What 1D tables leave of a map.
+
+    Attributes
+    ----------
+    parts : tuple of OneAxisPart
+        What they can correct.
+    beyond : float
+        What no 1D table of the same axes corrects, rms of the vectors, m.
+    squareness_left : float
+        Squareness that tables of straightness leave, rad; 0 if a table corrects it.
+    """
+
+    parts: tuple[OneAxisPart, ...]
+    beyond: float
+    squareness_left: float = 0.0
+
+
+def one_axis_fit(error_map: ErrorMap, tables: Sequence[Table1D], frame: MachineFrame,
+                 setup: MachineSetup) -> OneAxisFit:
+    """Return what 1D tables of x and y leave of a map.
+
+    Parameters
+    ----------
+    error_map : ErrorMap
+        The error to correct. Unknown nodes are filled from their neighbours.
+    tables : sequence of Table1D
+        Tables of x and y that are loaded together.
+    frame : MachineFrame
+        Wiring of the axes.
+    setup : MachineSetup
+        Settings of the controller.
+    """
+    whole, _ = fill_unknown(error_map)
+    names: dict[int, Axis] = {frame.x_axis: "x", frame.y_axis: "y"}
+    loaded: dict[Pair, list[Table1D]] = defaultdict(list)
+    for table in tables:
+        loaded[names[table.reference], names[table.axis]].append(table)
+
+    along_own: list[_PairOfAxes] = []
+    across: list[_PairOfAxes] = []
+    for pair, of_pair in loaded.items():
+        part = _PairOfAxes(whole, of_pair, pair, frame=frame, setup=setup)
+        (along_own if pair[0] == pair[1] else across).append(part)
+
+    parts = [part.judged(part.targets, part.correction) for part in along_own]
+    parts += [part.judged(part.shapes, part.shape, ", without its slope") for part in across]
+    turning = [part for part in across if part.has_slope]
+    squareness_left = 0.0
+    if turning:
+        parts.append(_squareness(whole, turning, across))
+    elif across:
+        squareness_left = _squareness_of(whole)
+    return OneAxisFit(tuple(parts), _beyond(whole, tuple(loaded)), squareness_left)
+
+
+class _PairOfAxes:
+    """The tables that correct one axis from the position of one axis, at the nodes of a map.
+
+    Parameters
+    ----------
+    whole : ErrorMap
+        Without unknown nodes.
+    tables : list of Table1D
+        The tables.
+    pair : Pair
+        Their axes.
+    frame, setup : MachineFrame, MachineSetup
+        The controller.
+    """
+
+    def __init__(self, whole: ErrorMap, tables: list[Table1D], pair: Pair, *,
+                 frame: MachineFrame, setup: MachineSetup) -> None:
+        self.pair = pair
+        self.u = _known_rms(whole.u_gx if pair[1] == "x" else whole.u_gy)
+        bound = [bound_1d(table, setup) for table in tables]
+        slopes, shapes = zip(*(_makes(table) for table in bound), strict=True)
+        self.has_slope, self.has_shape = any(slopes), any(shapes)
+
+        self.nodes = whole.artifact.x_m[:, 0] if pair[0] == "x" else whole.artifact.y_m[0]
+        places = [_stage_positions(table, pair[0], frame) for table in bound]
+        inside = [p[(p > self.nodes[0]) & (p < self.nodes[-1])] for p in places]
+        self.places = np.unique(np.concatenate([self.nodes, *inside]))
+        self.at_nodes = np.searchsorted(self.places, self.nodes)
+
+        machine = frame.to_machine(self.places, self.places)["xy".index(pair[0])]
+        axes = {"x": frame.x_axis, "y": frame.y_axis}
+        sign = {"x": frame.sign_x, "y": frame.sign_y}[pair[1]]
+        added = CalEvaluator(tables, setup).corrections({axes[pair[0]]: machine})[axes[pair[1]]]
+        self.correction = sign * frame.unit_m * added
+        self.targets = [_mean_line(whole, pair), map_line(whole, *pair).corrections_m]
+
+    @property
+    def shape(self) -> np.ndarray:
+        """The correction without its slope over the nodes, m."""
+        return self.correction - self.slope(self.correction[self.at_nodes]) * self.places
+
+    @property
+    def shapes(self) -> list[np.ndarray]:
+        """What it may be at the nodes, m: of tables of squareness alone, nothing."""
+        found = [target - self.slope(target) * self.nodes for target in self.targets]
+        return found if self.has_shape else [*found, np.zeros(len(self.nodes))]
+
+    def slope(self, values: np.ndarray) -> float:
+        """Return the least-squares slope of values at the nodes."""
+        return _slope(self.nodes, values)
+
+    def judged(self, targets: list[np.ndarray], correction: np.ndarray,
+               without: str = "") -> OneAxisPart:
+        """Return what a correction (places,) leaves of that target (nodes,) which it suits best.
+
+        Between the nodes the error of the stage is known to the difference of the straight line
+        and the cubic spline.
+        """
+        found = []
+        for target in targets:
+            line = np.interp(self.places, self.nodes, target)
+            left = correction - line
+            left = left - left[self.at_nodes].mean()
+            left = np.maximum(np.abs(left) - np.abs(self._spline(target) - line), 0.0)
+            found.append((rms(left[self.at_nodes]), float(left.max())))
+        rms_left, largest_left = min(found)
+        part = targets[0] - targets[0].mean()
+        along, corrected = self.pair
+        return OneAxisPart(f"{corrected} from the position of {along}{without}", rms(part),
+                           float(np.abs(part).max()), rms_left, largest_left, self.u)
+
+    def _spline(self, target: np.ndarray) -> np.ndarray:
+        if len(self.nodes) < SPLINE_NODES:
+            return np.interp(self.places, self.nodes, target)
+        return CubicSpline(self.nodes, target)(self.places)
+
+
+def _makes(table: BoundTable1D) -> tuple[bool, bool]:
+    """Return whether a table has a slope, and a shape; one without either should have both."""
+    position = table.track.step * np.arange(table.track.count)
+    slope = _slope(position, table.values) * (position - position.mean())
+    shape = table.values - table.values.mean() - slope
+    if not np.ptp(table.values):
+        return True, True
+    return rms(slope) > NONE_OF_IT * rms(shape), rms(shape) > NONE_OF_IT * rms(slope)
+
+
+def _stage_positions(table: BoundTable1D, axis: Axis, frame: MachineFrame) -> np.ndarray:
+    """Return the positions of a table's entries in the stage frame, m."""
+    positions = table.track.first + table.track.step * np.arange(table.track.count)
+    return frame.from_machine(positions, positions)["xy".index(axis)]
+
+
+def _squareness(whole: ErrorMap, turning: list[_PairOfAxes],
+                across: list[_PairOfAxes]) -> OneAxisPart:
+    """Return what tables with slopes leave of the squareness of a map.
+
+    A turn of both axes alike is the choice of the frame: only the sum of the slopes counts. In the
+    frame of the map each slope may be that of the map, too.
+    """
+    added = [part.slope(part.correction[part.at_nodes]) for part in across]
+    whole_slope = _squareness_of(whole)
+    own = [max(abs(slope - part.slope(target))
+               for slope, part, target in zip(added, across, targets, strict=True)
+               if part.has_slope)
+           for targets in product(*(part.targets for part in across))]
+    left = min(abs(sum(added) - whole_slope), *own)
+    nodes, u = turning[0].nodes, turning[0].u
+    far = float(np.abs(nodes).max())
+    return OneAxisPart("squareness", abs(whole_slope) * rms(nodes), abs(whole_slope) * far,
+                       left * rms(nodes), left * far, u)
+
+
+def _beyond(whole: ErrorMap, pairs: Sequence[Pair]) -> float:
+    """Return what is left of a map by the best 1D tables of these axes, rms of the vectors, m."""
+    left = np.stack([whole.gx, whole.gy])
+    for along, corrected in pairs:
+        line = _mean_line(whole, (along, corrected))
+        left["xy".index(corrected)] -= line[:, None] if along == "x" else line[None, :]
+    if any(along != corrected for along, corrected in pairs):  # square, and in any turn
+        x, y = whole.artifact.x_m, whole.artifact.y_m
+        left -= np.stack([y * _slope(y.ravel(), left[0].ravel()),
+                          x * _slope(x.ravel(), left[1].ravel())])
+    left -= left.mean(axis=(1, 2), keepdims=True)
+    return float(np.sqrt((left**2).sum(axis=0).mean()))
+
+
+def _mean_line(whole: ErrorMap, pair: Pair) -> np.ndarray:
+    """Return the error of an axis against the position of one axis, mean over the other, m."""
+    field = whole.gx if pair[1] == "x" else whole.gy
+    return field.mean(axis=1 if pair[0] == "x" else 0)
+
+
+def _squareness_of(whole: ErrorMap) -> float:
+    """Return the sum of the slopes of y along x and of x along y, rad; a turn cancels in it."""
+    artifact = whole.artifact
+    return (_slope(artifact.x_m[:, 0], _mean_line(whole, ("x", "y")))
+            + _slope(artifact.y_m[0], _mean_line(whole, ("y", "x"))))
+
+
+def _slope(position: np.ndarray, values: np.ndarray) -> float:
+    """Return the least-squares slope of values."""
+    from_middle = position - position.mean()
+    square = from_middle @ from_middle
+    return float(from_middle @ values / square) if square else 0.0
+
+
+def _known_rms(u: np.ndarray) -> float:
+    known = u[np.isfinite(u)]
+    return rms(known) if known.size else 0.0
