@@ -135,6 +135,21 @@ def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
     return out
 
 
+def first_order(artifact: Artifact, g_m: np.ndarray) -> tuple[float, float]:
+    """Return O and R (Hu eq. 6) of a map (2, nx, ny), m; NaN where it is unknown."""
+    known = np.isfinite(g_m).all(axis=0)
+    half_m = max(artifact.half) * artifact.grid_pitch_m
+    x, y = artifact.x_m / half_m, artifact.y_m / half_m
+    rigid = datum_modes(artifact, scale=True)
+    rigid[2:] /= half_m
+    modes = np.concatenate([rigid, [(y, x), (x, -y)]])[:, :, known]
+    rows = modes.reshape(len(modes), -1)
+    # A few sites may not separate the modes: the smallest coefficients that fit.
+    inverse = np.linalg.pinv(rows @ rows.T, rcond=1e-12, hermitian=True)
+    found = inverse @ (rows @ g_m[:, known].ravel())
+    return float(found[4]) / half_m, float(found[5]) / half_m
+
+
 def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     """Return the slopes of the XY error along the half axes +X, +Y, -X, -Y, rad (Hu eq. 27).
 

@@ -33,7 +33,6 @@ from selfcal_ros.estimation.comparison.maps import (
 from selfcal_ros.estimation.datum.covariance import NO_NOISE, USUAL_LEVEL
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, coverage_factor
 from selfcal_ros.estimation.joint.solve import factors_of
-from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.verdict.uncertainty import (
@@ -47,6 +46,7 @@ from selfcal_ros.model.error_map import (
     ErrorMap,
     ThetaDatum,
     datum_columns,
+    first_order,
     rms,
 )
 from selfcal_ros.model.recheck import Significance
@@ -704,7 +704,7 @@ def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str,
         dof[kind], k[kind] = mean.dof, coverage_factor(mean.dof)
 
     (gx, gy), (u_gx, u_gy) = maps["xy"], u["xy"]
-    o, r = first_order(first.artifact, gx + 1j * gy)
+    o, r = first_order(first.artifact, maps["xy"])
     emap = ErrorMap(first.artifact, gx, gy, u_gx, u_gy, maps["theta"][0], u["theta"][0], o, r,
                     ThetaDatum.ZERO_MEAN)
     unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known.sum())

@@ -27,12 +27,12 @@ from selfcal_ros.estimation.datum.covariance import (
 from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solve import factors_of
-from selfcal_ros.estimation.lattice.connectivity import Gauge, first_order
+from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, first_order
 from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
 from selfcal_ros.model.result import CalibrationResult
@@ -473,7 +473,7 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     found = result.artifact_map
     artifact = replace(result.plate, map_grid=None, harmonics=0)
     nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
-    o, r = first_order(artifact, found.ax + 1j * found.ay)
+    o, r = first_order(artifact, np.stack([found.ax, found.ay]))
     u_x, u_y, u_theta = (u if u.size else empty for u, empty in (
         (found.u_ax, nothing), (found.u_ay, nothing), (found.u_a_theta, none)))
     return replace(result, placed_plate=None, error_map=ErrorMap(

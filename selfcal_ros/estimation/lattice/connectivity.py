@@ -14,8 +14,6 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from selfcal_ros.model.artifact import Artifact
-
 
 @dataclass(frozen=True, eq=False)
 class Components:
@@ -237,13 +235,6 @@ class Gauge:
         known = np.where(self.known, field, 0.0).conj().reshape(-1)
         both = (self.shear.reshape(2, -1) @ known).real
         return float(both[0]), float(both[1])
-
-
-def first_order(artifact: Artifact, field: np.ndarray) -> tuple[float, float]:
-    """Return O and R (Hu eq. 6) of a map, complex (nx, ny), m; NaN where it is unknown."""
-    z, pitch_m = artifact.x_m + 1j * artifact.y_m, artifact.grid_pitch_m
-    o, r = Gauge(z / pitch_m, np.isfinite(field), scale=True).first_order(field)
-    return o / pitch_m, r / pitch_m
 
 
 def _modes(z: np.ndarray, known: np.ndarray) -> np.ndarray:

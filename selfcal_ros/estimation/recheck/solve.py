@@ -26,7 +26,6 @@ from selfcal_ros.estimation.joint.problem import (
     problem_of,
 )
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
-from selfcal_ros.estimation.lattice.connectivity import first_order
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR
@@ -58,7 +57,7 @@ from selfcal_ros.estimation.terms.visits import ground_of, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, rms
+from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, first_order, rms
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
@@ -131,7 +130,7 @@ class Rechecked:
                                 for part in (xy.values, np.sqrt(variance)))
         u_theta = np.sqrt(np.diag(self.of_lines))
         theta, u_theta = (self.lines.whole(part) for part in (self.lines.values, u_theta))
-        o, r = first_order(artifact, gx + 1j * gy)
+        o, r = first_order(artifact, np.stack([gx, gy]))
         return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN)
 
 
