@@ -2,17 +2,103 @@
 """compensator: true positions from indicated ones, and commands, with the calibrated error map."""
 
 import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from selfcal_msgs.srv import Correct
 
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
+from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.compensating import CompensatingSession
+from selfcal_ros.sessions.health import Diagnosis, Level, merged
+
+LOOK_S = 0.1
+"""Time between two looks at the publishers of maps."""
+ALONE_S = 1.0
+"""Time for which the publisher of a map must be alone before it is used: another one may be found
+later than a latched message."""
+MOST_WAITING = 20
+"""Messages that wait for that time; only the newest count."""
+KEPT = "maps from the network are not used until one node alone publishes them"
+
+
+class MapsOfOneNode:
+    """Subscribe to maps and summaries, and pass them on while one node alone publishes them.
+
+    Whose a message is cannot be told: while several nodes publish, none is passed on. Once one is
+    left, both topics are subscribed to anew, which brings its latched messages.
+
+    Parameters
+    ----------
+    node : CompensatorNode
+        The subscriber.
+    inputs : sequence of (Topic, callable)
+        The topics, and what takes a message of each.
+    """
+
+    def __init__(self, node: "CompensatorNode",
+                 inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]) -> None:
+        self._node = node
+        self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
+        self._waiting: deque[tuple[float, Callable[[], None]]] = deque(maxlen=MOST_WAITING)
+        self._rivals, self._rivals_s = "", 0.0  # last seen
+        self._subscriptions: list[Any] = []
+        self._subscribe()
+        node.own(self, MapsOfOneNode.close)
+        node.every(LOOK_S, self._look)
+
+    def diagnosis(self) -> Diagnosis:
+        """Return WARN while several nodes publish."""
+        return Diagnosis(Level.WARN, KEPT) if self._rivals else Diagnosis(Level.OK, "")
+
+    def close(self) -> None:
+        """End the subscriptions."""
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop())
+
+    def _subscribe(self) -> None:
+        for topic, take in self._inputs:
+            receive = partial(self._receive, topic.name, take)
+            self._subscriptions.append(self._node.subscribe(topic, receive))
+
+    def _receive(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
+        """Keep a message until its publisher has been alone for long enough."""
+        if self._has_rivals():
+            raise InputError(topic, f"a message is not used: {self._rivals}",
+                             "end all publishers but one")
+        self._waiting.append((time.monotonic(), partial(take, message)))
+
+    def _has_rivals(self) -> bool:
+        rivals = names.rivals(self._node, [topic.name for topic, _ in self._inputs])
+        if not rivals:
+            return False
+        if not self._rivals:
+            self._node.say(Level.WARN, f"{rivals}: {KEPT}")
+        self._rivals, self._rivals_s = rivals, time.monotonic()
+        self._waiting.clear()
+        return True
+
+    def _look(self) -> None:
+        """Pass on what has waited, or begin anew once one publisher is left."""
+        now_s = time.monotonic()
+        if self._has_rivals() or now_s - self._rivals_s < ALONE_S:
+            return
+        if self._rivals:
+            self._rivals = ""
+            self._node.say(Level.OK, "one node alone publishes maps again: they are used")
+            self.close()
+            self._subscribe()
+        while self._waiting and now_s - self._waiting[0][0] >= ALONE_S:
+            _, take = self._waiting.popleft()
+            take()
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):
@@ -24,6 +110,7 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
     session = WhileConfigured[CompensatingSession]()
     _input = WhileConfigured[ByTheClock]()
     _encoder = WhileConfigured[Any]()
+    _maps = WhileConfigured[MapsOfOneNode]()
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(CompensatorSettings, **kwargs)
@@ -38,13 +125,17 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
 
     def activate(self) -> None:
         """Subscribe to the maps and to the encoder."""
-        self.subscribe(names.SUMMARY, self.session.take_summary)
-        self.subscribe(names.ERROR_MAP, self.session.take_map)
+        self._maps = MapsOfOneNode(self, [(names.SUMMARY, self.session.take_summary),
+                                          (names.ERROR_MAP, self.session.take_map)])
         self._input = ByTheClock(names.ENCODER.name, self.session.receive,
                                  self.guarded(self._on_samples, names.ENCODER.name))
         self._encoder = self.subscribe(names.ENCODER_NEWEST, self._input, raw=True)
         self.subscribe(names.MOTION, self._on_command, raw=True)
         self.service(Correct, "~/correct", self._correct)
+
+    def diagnose_session(self) -> Diagnosis:
+        """Return the diagnosis of the session, and whether maps have several publishers."""
+        return merged(self.session.diagnosis(), [self._maps.diagnosis()])
 
     def _on_samples(self) -> None:
         """Correct waiting samples: called for the first one, which takes the others."""

@@ -44,6 +44,9 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
+PARTICIPANT = 12
+"""First bytes of an endpoint's identity that all endpoints of a process share (DDS)."""
+
 # encoder at 1 kHz: a pause of a second must not overwrite a sample
 ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
 ENCODER_EITHER = (ENCODER, Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False)))
@@ -126,6 +129,20 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
             found.append(f"{topic} has {len(offers)} publishers: "
                          f"{', '.join(sorted(map(_name, offers)))}; only one is allowed")
     return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
+
+
+def rivals(node: Node, topics: Iterable[str]) -> str:
+    """Return which of these topics several nodes publish on, and who, "" if none.
+
+    A node is told by its participant as well: two processes may bear one name.
+    """
+    found = []
+    for topic in topics:
+        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+        if len({(_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT])) for offer in offers}) > 1:
+            found.append(f"{topic} has {len(offers)} publishers: "
+                         f"{', '.join(sorted(map(_name, offers)))}")
+    return "; ".join(found)
 
 
 def kept_names(node: Node, topic: Topic) -> tuple[str, str]:

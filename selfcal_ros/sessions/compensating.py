@@ -17,8 +17,9 @@ from selfcal_ros.compensation.compensator import Compensator, Interpolation
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
-from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.model.error_map import ErrorMap, first_order
 from selfcal_ros.model.result import VERIFICATION, CalibrationResult
+from selfcal_ros.reporting.summary.numbers import summary_figures
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, merged
 from selfcal_ros.units import MS_PER_S, S_PER_NS
 
@@ -30,6 +31,8 @@ FARTHEST = 1e12
 LEAST_RADIUS_M = 0.02
 """Distance from the axis at which an angular error counts at least: the map of a tiny plate may
 turn the stage by any angle otherwise."""
+SAME_FIGURE = 1e-6
+"""Largest relative difference of a figure of a map and the same figure stated with it."""
 
 
 class CompensatingSession:
@@ -60,7 +63,7 @@ class CompensatingSession:
         self._other_frame = ""  # of the last command that names another than the stage's
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
-        self._waits = ""
+        self._waits = self._contradicted = ""
         self._used, self._since_s, self._map_ns = "", 0.0, 0
         if settings.map:
             self._load_file(settings.map)
@@ -89,16 +92,21 @@ class CompensatingSession:
     def _judge(self) -> None:
         if self._map is None:
             return
-        waits = self._doubt() if self._settings.require_qualified else ""
+        doubt = self._doubt() if self._settings.require_qualified else ""
+        self._contradicted = contradicted = self._contradiction()
+        waits = contradicted or doubt
         if waits != self._waits and waits:
-            self._ports.say(Level.OK, f"the newest map is not used: {waits}")
+            self._ports.say(Level.WARN if contradicted else Level.OK,
+                            f"the newest map is not used: {waits}")
         self._waits = waits
         if not waits:
             message, self._map = self._map, None
             try:
                 self._refuse_other_frame(message)
-                self._use(to_model.error_map(message), _source(message),
-                          to_model.stamp_ns(message), str(getattr(message, "interpolation", "")))
+                error_map = to_model.error_map(message)
+                _refuse_other_axes(error_map, _source(message))
+                self._use(error_map, _source(message), to_model.stamp_ns(message),
+                          str(getattr(message, "interpolation", "")))
             except InputError as error:
                 self._waits = str(error)
                 raise
@@ -117,14 +125,38 @@ class CompensatingSession:
         message, summary = self._map, self._summary
         if not message.qualified:
             return f"{_source(message)} is not qualified"
-        if summary is None or summary.run_id != message.run_id or (
-                to_model.stamp_ns(summary) != to_model.stamp_ns(message)):
+        if summary is None or not self._is_of_one_result():
             return f"no selfcal/summary says yet whether {_source(message)} is complete"
         if not summary.qualified:
             return f"{_source(message)} is not qualified: {summary.state}"
         if summary.views_done < summary.views_planned:
             return (f"{_source(message)} contains {summary.views_done} of {summary.views_planned} "
                     "views")
+        return ""
+
+    def _is_of_one_result(self) -> bool:
+        """Whether newest map and newest summary are of the same run and stamp."""
+        message, summary = self._map, self._summary
+        return (summary is not None and summary.run_id == message.run_id
+                and to_model.stamp_ns(summary) == to_model.stamp_ns(message))
+
+    def _contradiction(self) -> str:
+        """Return which figure of its own summary contradicts the newest map, or "".
+
+        A figure that is 0 or not finite is not stated.
+        """
+        if not self._is_of_one_result():
+            return ""
+        try:
+            figures = summary_figures(to_model.error_map(self._map))
+        except InputError:
+            return ""  # refused with its reason when it is used
+        for name, value in figures.items():
+            stated = float(getattr(self._summary, name))
+            if stated and math.isfinite(stated) and not math.isclose(stated, value,
+                                                                     rel_tol=SAME_FIGURE):
+                return (f"selfcal/summary states {name} {stated:.6g}, and the map of "
+                        f"{_source(self._map)} has {value:.6g}: it is not the map that was solved")
         return ""
 
     def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, stated: str) -> None:
@@ -360,7 +392,29 @@ class CompensatingSession:
             **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {})}
         if 0 < self._settings.max_map_age < age:
             return Diagnosis(Level.WARN, f"the map is {age:.0f} s old: calibrate again", values)
-        return Diagnosis(Level.OK, f"correcting by the map of {self._used}{waits}", values)
+        return Diagnosis(Level.WARN if self._contradicted else Level.OK,
+                         f"correcting by the map of {self._used}{waits}", values)
+
+
+def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
+    """Refuse a map whose O and R are not those that it states, as after an exchange of axes.
+
+    An exchange changes the sign of R, a mirror that of O. A map that states neither is not
+    compared.
+    """
+    stated = error_map.nonorthogonality, error_map.scale_difference
+    if not all(map(math.isfinite, stated)) or not any(stated):
+        return
+    found = first_order(error_map.artifact, np.stack([error_map.gx, error_map.gy]))
+    half_m = max(error_map.artifact.half) * error_map.artifact.grid_pitch_m
+    largest_m = float(np.nanmax(np.hypot(error_map.gx, error_map.gy)))
+    if max(abs(a - b) for a, b in zip(found, stated, strict=True)) * half_m > (
+            SAME_FIGURE * largest_m):
+        raise InputError(
+            f"the map of {source}", "its non-orthogonality and scale difference are "
+            f"{found[0]:.4g} and {found[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: "
+            "axes were exchanged or reversed, or numbers changed, after it was solved",
+            "publish the map as the solver does")
 
 
 def _source(message: Any) -> str:

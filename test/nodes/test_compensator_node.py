@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
 from selfcal_msgs.srv import Correct
 
 from selfcal_ros.compensation.compensator import Compensator
@@ -17,13 +18,13 @@ from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import names
-from selfcal_ros.nodes.compensator import CompensatorNode
+from selfcal_ros.nodes.compensator import KEPT, CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.sessions.compensating import KEEPS_UP
 from test.support.maps import random_map, result_of
 from test.support.waiting import PATIENCE_S
 
-MAP = random_map(Artifact(5, 0.01, 8), 3)
+MAP, OTHER = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
 BENCH = Path(__file__).parents[1] / "bench" / "compensate.py"
 PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.09, -1.0)]
 
@@ -204,6 +205,49 @@ def test_a_second_publisher_of_maps_is_named(graph):
     line = "selfcal/error_map has 2 publishers: /hand, /hand; only one is allowed"
     graph.until(lambda: said and line in said[-1].status[0].message, "the warning")
     assert said[-1].status[0].level == b"\x01"
+
+
+def publish_map(graph, by, error_map, stamp_ns: int) -> None:
+    """Publish a map and its summary by a node."""
+    summary = {"header": from_model.header(stamp_ns, "stage"), "qualified": True, "views_done": 4,
+               "views_planned": 4}
+    for topic, fields in ((names.ERROR_MAP, from_model.error_map(
+            result_of(error_map), stamp_ns, "stage")), (names.SUMMARY, summary)):
+        publisher = by.create_publisher(topic.type, topic.name, topic.qos)
+        publisher.publish(fill(topic.type(), fields))
+
+
+@pytest.mark.usefixtures("quick_beat")
+@pytest.mark.parametrize("leaves", ["intruder", "solver"])
+def test_a_map_of_a_second_node_is_not_used_until_one_is_left(graph, leaves):
+    node = graph.node(CompensatorNode)
+    others = {name: Node(name, context=graph.context) for name in ("solver", "intruder")}
+    for other in others.values():
+        graph.add(other)
+    heard: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    publish_map(graph, others["solver"], MAP, 1)
+    graph.until(lambda: node.session.compensator is not None, "the map of the solver")
+    first = node.session.compensator
+    publish_map(graph, others["intruder"], OTHER, 2)
+    graph.until(lambda: any(KEPT in status.message and status.level == b"\x01"
+                            and "2 publishers: /intruder, /solver" in status.message
+                            for array in heard for status in array.status), "the warning")
+    assert node.refusals.counts[names.ERROR_MAP.name] > 0
+    graph.remove(others[leaves])
+    kept = {"intruder": MAP, "solver": OTHER}[leaves]
+    graph.until(lambda: node.session.compensator is not first, "the latched map of who is left")
+    assert node.session.compensator.correct(0.01, 0.0) == Compensator(kept).correct(0.01, 0.0)
+
+
+def test_of_two_nodes_that_were_there_before_no_map_is_used(graph):
+    others = [Node(name, context=graph.context) for name in ("solver", "intruder")]
+    for number, (other, error_map) in enumerate(zip(others, (MAP, OTHER), strict=True)):
+        graph.add(other)
+        publish_map(graph, other, error_map, number + 1)
+    node = graph.node(CompensatorNode)
+    graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
+    assert node.session.compensator is None
 
 
 def test_a_malformed_map_does_not_end_the_node(graph):

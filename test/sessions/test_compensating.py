@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import digests_of, result_to_dict
+from selfcal_ros.reporting.summary.numbers import summary_figures
 from selfcal_ros.sessions.compensating import KEEPS_UP, CompensatingSession
 from selfcal_ros.sessions.health import Level
-from test.support.maps import random_map, result_of
+from test.support.maps import first_order, random_map, result_of
 from test.support.ports import START_NS, Hands, message, settings_of
 
 ONE, TWO = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
@@ -247,6 +249,65 @@ def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(
     assert desk.x_at(0.01) == before
     assert desk.hands.lines(Level.OK)[-1] == f"the newest map is not used: {why}"
     assert desk.session.diagnosis().message.endswith(f"; not used: {why}")
+
+
+def stated(error_map):
+    """Return a map with its own O and R."""
+    o, r = first_order(error_map.artifact, error_map.gx, error_map.gy)
+    return replace(error_map, nonorthogonality=o, scale_difference=r)
+
+
+def exchanged(error_map):
+    """Return a map with x and y exchanged, as positions and as errors."""
+    swapped = {name: getattr(error_map, other).T for name, other in (
+        ("gx", "gy"), ("gy", "gx"), ("u_gx", "u_gy"), ("u_gy", "u_gx"))}
+    return replace(error_map, **swapped)
+
+
+def mirrored(error_map):
+    """Return a map with x reversed, as position and as error."""
+    fields = {name: getattr(error_map, name)[::-1] for name in ("gx", "gy", "u_gx", "u_gy")}
+    return replace(error_map, **fields | {"gx": -fields["gx"]})
+
+
+def renamed(error_map):
+    return replace(error_map, gx=error_map.gy, gy=error_map.gx)
+
+
+def reversed_sign(error_map):
+    return replace(error_map, gx=-error_map.gx)
+
+
+@pytest.mark.parametrize("qualified_only", [True, False])
+@pytest.mark.parametrize("change", [exchanged, mirrored, renamed, reversed_sign])
+def test_a_map_with_changed_axes_leaves_the_former_one_in_use(change, qualified_only):
+    desk = Desk(require_qualified=qualified_only)
+    use(desk, stated(TWO))
+    before = desk.x_at(0.01)
+    desk.session.take_summary(summary_of(START_NS + 1))
+    with pytest.raises(InputError, match="axes were exchanged or reversed"):
+        desk.session.take_map(map_of(change(stated(ONE)), START_NS + 1))
+    assert desk.x_at(0.01) == before
+    desk.session.take_map(map_of(stated(ONE), START_NS + 1))
+    assert desk.x_at(0.01) != before
+
+
+@pytest.mark.parametrize("name", ["max_error_um", "rms_error_um", "rms_uncertainty_um",
+                                  "max_theta_error_arcsec", "rms_theta_uncertainty_arcsec"])
+@pytest.mark.parametrize("qualified_only", [True, False])
+def test_a_map_that_its_summary_contradicts_leaves_the_former_one_in_use(name, qualified_only):
+    desk = Desk(require_qualified=qualified_only)
+    use(desk, TWO)
+    before, figures = desk.x_at(0.01), summary_figures(ONE)
+    desk.session.take_summary(summary_of(START_NS + 1, **figures | {name: 1.01 * figures[name]}))
+    desk.session.take_map(map_of(ONE, START_NS + 1))
+    assert desk.x_at(0.01) == before
+    line = desk.hands.lines(Level.WARN)[-1]
+    assert f"the newest map is not used: selfcal/summary states {name} " in line
+    assert desk.session.diagnosis().level == Level.WARN
+    desk.session.take_summary(summary_of(START_NS + 1, **figures))
+    assert desk.x_at(0.01) != before
+    assert desk.session.diagnosis().level == Level.OK
 
 
 @pytest.mark.parametrize("planned, used", [(0, True), (4, True), (5, False)])

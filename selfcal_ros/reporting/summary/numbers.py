@@ -191,14 +191,20 @@ def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
     """
     if result is None:
         return dict.fromkeys(_SUMMARY_FIELDS, math.nan)
-    figures, (u_rms, u_max, _) = map_figures(result.error_map), anywhere_m(result)
+    u_rms, u_max, _ = anywhere_m(result)
+    return {**summary_figures(result.error_map),
+            "rms_uncertainty_anywhere_um": u_rms * UM_PER_M,
+            "max_uncertainty_anywhere_um": u_max * UM_PER_M}
+
+
+def summary_figures(emap: ErrorMap) -> dict[str, float]:
+    """Return the numbers of a CalibrationSummary that follow from its map alone."""
+    figures = map_figures(emap)
     return {"max_error_um": figures.max_error_m * UM_PER_M,
             "rms_error_um": figures.rms_error_m * UM_PER_M,
             "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
             "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
-            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD,
-            "rms_uncertainty_anywhere_um": u_rms * UM_PER_M,
-            "max_uncertainty_anywhere_um": u_max * UM_PER_M}
+            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD}
 
 
 def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
