@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of `selfcal cell check`: a short run that shows the faults of a cell."""
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -45,7 +45,9 @@ turn for which this is not chance."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 MOST_NAMED = 5
-"""Nodes in error that are named."""
+"""Nodes in error, or joints, that are named."""
+MOST_KEPT = 100
+"""Names of statuses, and of joints, that are kept: whoever publishes can make up names for ever."""
 REVISIT_S = 10.0
 """Time within which a cell must revisit a missing mark."""
 OLDEST_S = 10.0
@@ -138,6 +140,7 @@ class CellCheck:
         self._joints: set[str] = set()
         self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
         self._foreign: dict[str, str] = {}  # ERRORs on /diagnostics, by the names of their statuses
+        self._has_unread = False  # whether there were more of them at a time than are kept
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run_and_diagnosed()
@@ -148,9 +151,24 @@ class CellCheck:
         """Take a sample of the encoder."""
         sample: EncoderSample = to_model.encoder_sample(message)
         self._samples.append((sample.stamp_ns, self._ports.now_ns() - sample.stamp_ns))
-        self._joints.update(sample.names)
+        self._note_joints(sample.names)
         self._collector.add_encoder(sample)
         self._events.append(sample)
+
+    def _note_joints(self, names: Iterable[str]) -> None:
+        """Keep the names of joints: all that are wanted, of others so many."""
+        for name in names:
+            if name in self._wanted_joints:
+                self._joints.add(name)
+            elif len(self._joints) < MOST_KEPT:
+                self._joints.add(printable(name))
+
+    @property
+    def _wanted_joints(self) -> list[str]:
+        """Joints of the stage that the run needs."""
+        settings = self._settings
+        joints = [settings.joint_x, settings.joint_y]
+        return [*joints, settings.joint_theta] if self.view.angular else joints
 
     def take_detection(self, message: Any) -> None:
         """Take a detection."""
@@ -168,9 +186,14 @@ class CellCheck:
 
     def take_diagnosis(self, name: str, level: int, line: str) -> None:
         """Take a status of /diagnostics, of whichever node; a later one of a name replaces it."""
+        name = printable(name)
         self._foreign.pop(name, None)
-        if level == Level.ERROR:
-            self._foreign[name] = line
+        if level != Level.ERROR:
+            return
+        if len(self._foreign) < MOST_KEPT:
+            self._foreign[name] = printable(line)
+        else:
+            self._has_unread = True
 
     def tick(self) -> None:
         """Perform due work."""
@@ -180,12 +203,15 @@ class CellCheck:
     def _run_and_diagnosed(self) -> Steps[None]:
         """Check the cell, then tell which nodes are in error at the end."""
         yield from self._run()
-        if self._foreign:
-            named = [f"{printable(name)}: {printable(line)}"
-                     for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)]
-            more = len(self._foreign) - len(named)
-            self._tell("diagnostics", False, "ERROR on /diagnostics: " + "; ".join(named)
-                       + f"; and {more} more" * (more > 0),
+        if self._foreign or self._has_unread:
+            said = [f"{name}: {line}"
+                    for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)]
+            more = len(self._foreign) - len(said)
+            if more > 0:
+                said.append(f"and {more} more")
+            if self._has_unread:
+                said.append(f"there were more than {MOST_KEPT} names, and others were not read")
+            self._tell("diagnostics", False, "ERROR on /diagnostics: " + "; ".join(said),
                        "correct what these nodes say, or end them if they are not of this machine")
 
     def _run(self) -> Steps[None]:
@@ -351,9 +377,8 @@ class CellCheck:
     def _judge_encoder(self) -> bool:
         """Tell joints, rate and clock; return whether the joints are there."""
         settings, (stamps, ages) = self._settings, np.array(self._samples).T
-        joints = [settings.joint_x, settings.joint_y] + [settings.joint_theta] * self.view.angular
-        missing = [joint for joint in joints if joint not in self._joints]
-        self._tell("joints", not missing, f"heard {', '.join(sorted(self._joints))}",
+        missing = [joint for joint in self._wanted_joints if joint not in self._joints]
+        self._tell("joints", not missing, f"heard {printable(', '.join(sorted(self._joints)))}",
                    f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
                    "measurement_collector")
         steps = np.diff(np.sort(stamps)) * S_PER_NS

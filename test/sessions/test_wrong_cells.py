@@ -4,13 +4,14 @@
 Each wrong cell fails; the first line names its fault, and what follows from it is told as such.
 """
 
+import tracemalloc
 from itertools import islice
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from selfcal_ros.sessions.cell_check import CellCheck, CheckItem, grouped
+from selfcal_ros.sessions.cell_check import MOST_KEPT, CellCheck, CheckItem, grouped
 from selfcal_ros.sessions.health import Level
 from test.support.bench_cell import Bench
 from test.support.ports import Hands, settings_of
@@ -133,14 +134,17 @@ FIELDS = {"m": 0, "n": 0, "k": 0, "offset_x": 0.0, "offset_y": 0.0, "offset_thet
           "sigma": 0.0}
 
 
-def checked(fault="", statuses=(), **cell):
-    """Return the items of a check of a cell, beside nodes with these statuses."""
+def checked(fault="", statuses=(), joints=(), **cell):
+    """Return the items of a check of a cell, beside nodes with these statuses, and other joints."""
     hands = Hands()
     bench = Cell(fault, hands, **cell)
     check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
                                     hands.ports, settle_s=0.2, patience_s=30.0)
     for status in statuses:
         check.take_diagnosis(*status)
+    if joints:
+        check.take_encoder(SimpleNamespace(header=bench.header(0.0), name=joints,
+                                           position=[0.0] * len(joints)))
     while not check.done:
         hands.published.clear()
         check.tick()
@@ -227,6 +231,44 @@ def test_other_nodes_in_error_fail_the_check_of_a_right_cell(statuses, told):
     failed = [item for item in checked(statuses=statuses) if not item.passed]
     assert [item.name for item in failed] == ["diagnostics"] * bool(told)
     assert not told or failed[0].figure.endswith(told)
+
+
+def kept_of(number: int) -> int:
+    """Return the memory, bytes, that as many statuses in error, each of a new name, take."""
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), Hands().ports)
+    tracemalloc.start()
+    for name in range(number):
+        check.take_diagnosis(f"{name} " + "x" * 20_000, Level.ERROR, "y" * 20_000)
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return kept
+
+
+def test_names_of_statuses_without_end_take_no_memory():
+    assert kept_of(8 * MOST_KEPT) < 1.1 * kept_of(MOST_KEPT) < 1_000_000
+
+
+def test_joints_without_end_do_not_hide_those_of_the_stage():
+    made_up = [f"{number} " + "z" * 20_000 for number in range(2 * MOST_KEPT)]
+    joints = next(item for item in checked(joints=made_up) if item.name == "joints")
+    assert joints.passed and len(joints.figure) < 10_000
+
+
+def test_what_was_not_read_is_said_and_fails():
+    statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
+    statuses += [(name, Level.OK, "on") for name, _, _ in statuses[1:]]
+    item, = (item for item in checked(statuses=statuses) if not item.passed)
+    assert item.figure == ("ERROR on /diagnostics: axis 000: off; there were more than 100 names, "
+                           "and others were not read")
+
+
+def test_a_status_that_is_known_is_read_however_many_there_are():
+    statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
+    item, = (item for item in checked(statuses=[*statuses, ("axis 000", Level.ERROR, "hot")])
+             if not item.passed)
+    assert item.figure.startswith("ERROR on /diagnostics: axis 000: hot; axis 001: off; ")
+    assert item.figure.endswith("; and 95 more; there were more than 100 names, and others were "
+                                "not read")
 
 
 def test_two_publishers_are_the_only_fault():
