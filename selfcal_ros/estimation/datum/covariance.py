@@ -191,10 +191,10 @@ class MapsCovariance:
         the misalignments, (3 views, k), and of the terms, (p, k).
         """
         grid, of_terms = self.system.grid, self._of_terms(g, a)
-        cov = np.real(a.conj().T @ (self._noise[:, None] * a))
-        g, moved = self._readings(g, a)
-        cov += np.real(g.conj().T @ grid.factor.solve(np.ascontiguousarray(g)))
-        return cov, moved - np.real(grid.response.conj().T @ g), of_terms
+        cov = np.real(a.conj().T @ (grid.noise_of_means[:, None] * a))
+        g, moved = grid.functionals(g, a)
+        cov += np.real(g.conj().T @ grid.solve(g))
+        return cov, moved, of_terms
 
     def sensitivities(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return those of functionals as in `of` to the readings, over their weights, plate frame.
@@ -207,7 +207,7 @@ class MapsCovariance:
         maps = (field - terms.fields @ taken).T.reshape(-1, *grid.views.shape)
         y = np.tensordot(taken.T, terms.columns, axes=1) if len(taken) else np.zeros(1)
         rest = grid.plate(-y, maps, (parameters - self._moved @ taken).T)[1]
-        of_mark = (self._noise[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
+        of_mark = (grid.noise_of_means[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
         return np.where(grid.read, of_mark, 0) - rest
 
     def variance_of_scale(self, reference: ReferenceLength) -> float:
@@ -245,29 +245,6 @@ class MapsCovariance:
     def functionals(self, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return functionals (k, nx, ny) of the stage's map as those of the free maps."""
         return self._functionals(sites, None)[:2]
-
-    def _readings(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return functionals of free maps as those of G and of the misalignments alone.
-
-        But for the means of the marks, whose factors are `a`.
-        """
-        grid = self.system.grid
-        moved = np.zeros((grid.n_views, 3, g.shape[1]))
-        if not a.any():
-            return g, moved.reshape(-1, g.shape[1])
-        out = np.array(g.T, dtype=complex, order="C").reshape(-1, *grid.views.shape)
-        marks = a.T.reshape(-1, *grid.views.plate_shape)
-        for v, part in enumerate(grid.relative_weight):
-            grid.views.add_scattered(out, v, -part * marks)
-            sums = np.einsum("cij,kij->ck", np.conj(grid.shapes), part * marks)
-            moved[v] = -sums[0].real, -sums[1].real, -sums[1].imag
-        return out.reshape(g.shape[1], -1).T, moved.reshape(-1, g.shape[1])
-
-    @property
-    def _noise(self) -> np.ndarray:
-        """Variance of the mean of each mark, (marks,); 0 where not read."""
-        total = self.system.grid.weight.sum(axis=0).ravel()
-        return np.where(total > 0, 1 / np.where(total > 0, total, 1.0), 0.0)
 
     def _of_length(self, z: np.ndarray) -> np.ndarray:
         """Return the variances that the reference itself adds at places, (2, places)."""
@@ -322,10 +299,9 @@ class MapsCovariance:
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
         """
         grid, taken = self.system.grid, -self.terms.covariance @ self._of_terms(g, a)
-        g, moved = self._readings(g, a)
-        parameters = self._p @ (moved - np.real(grid.response.conj().T @ g))
-        field = grid.factor.solve(np.ascontiguousarray(g)) - grid.response @ parameters
-        return field, parameters, taken
+        g, moved = grid.functionals(g, a)
+        parameters = self._p @ moved
+        return grid.solve(g) - grid.response @ parameters, parameters, taken
 
     def _of_map(self, *, plate: bool) -> np.ndarray:
         """Return the variances of a map in its datum, (2, places), but for the reference's own."""
@@ -333,8 +309,9 @@ class MapsCovariance:
         field, parameters, taken = self._solved(g, a)
         own, answer, of_terms = grid.variance_of_sites, grid.response, self.terms.fields
         if plate:
-            field = self._plates(field, parameters) + self._noise[:, None] * a
-            own, of_terms = self._noise + grid.variance_of_means, self.terms.plates
+            noise = grid.noise_of_means
+            field = self._plates(field, parameters) + noise[:, None] * a
+            own, of_terms = noise + grid.variance_of_means, self.terms.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
         return in_datum(own, ((answer, self._p), (of_terms, self.terms.covariance)),
                         field - of_terms @ taken, fields, self.of_free(g, a))
@@ -447,7 +424,7 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     inverse = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
     response = angular.response[:, free]
-    spread = angular.solve(np.ascontiguousarray(rows.T))
+    spread = angular.solve(rows.T)
     spread = spread + response @ (inverse @ (response.T @ rows.T))
     n, ones = len(rows), rows.sum(axis=1)
     border = np.zeros((n + 1, n + 1))
@@ -502,15 +479,14 @@ class LinesCovariance:
     def __init__(self, cover: MapsCovariance, sigma: tuple[float, float]) -> None:
         self.cover, self.system, self.angular = cover, cover.system, cover.system.angular
         self._xy2, self._theta2 = sigma[0] ** 2, sigma[1] ** 2
-        total = self.angular.weight.sum(axis=0)
-        self._of_means = np.where(total > 0, self._theta2 / np.where(total > 0, total, 1.0), 0.0)
+        self._of_means = self._theta2 * self.angular.noise_of_means
 
     @cached_property
     def terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Free angular maps of stage and plate for a unit of each coefficient, (K, p)."""
         terms, field = self.cover.terms, -self.cover.terms.turned
         phi = terms.parameters[self.system.phi_at] / self.cover.length
-        return field, self._plate(np.moveaxis(terms.lines, 0, -1), field, phi)
+        return field, self.angular.plate(terms.lines, field.T, phi.T)[0].T
 
     def of_stage(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
@@ -558,7 +534,7 @@ class LinesCovariance:
             Factors of both XY maps in addition, 1/m.
         """
         rows, factors, of_terms, cov = self._free(stage, plate, maps)
-        cov = cov + self._theta2 * (rows.T @ self.angular.solve(np.ascontiguousarray(rows)))
+        cov = cov + self._theta2 * (rows.T @ self.angular.solve(rows))
         cov += (plate.T * self._of_means) @ plate
         cov += self._xy2 * (factors.T @ self.cover.inverse @ factors)
         cov += of_terms.T @ self._of_terms @ of_terms
@@ -570,13 +546,9 @@ class LinesCovariance:
 
         And the covariance of the part that is of sites and marks alone, (k, k), rad^2.
         """
-        angular, share = self.angular, self.angular.relative_weight
-        rows, read = stage.copy(), np.flatnonzero(plate.any(axis=1))
-        for view in range(angular.n_views):
-            rows -= angular.rows(view, read).T @ (share[view, read, None] * plate[read])
+        rows, of_rotations = self.angular.functionals(stage, plate)
         factors = np.zeros((self.system.size, rows.shape[1]))
-        factors[self.system.phi_at] = -(angular.response.T @ rows + share @ plate)
-        factors /= self.cover.length
+        factors[self.system.phi_at] = of_rotations / self.cover.length
         of_terms = self.terms[0].T @ stage + self.terms[1].T @ plate
         if maps is None:
             return rows, factors, of_terms, np.zeros((rows.shape[1],) * 2)
@@ -590,15 +562,10 @@ class LinesCovariance:
         rows, factors, of_terms, _ = self._free(stage, plate, maps)
         moved = self._of_terms @ of_terms
         phi = self._xy2 / self.cover.length * (self.cover.inverse @ factors)[self.system.phi_at]
-        field = self._theta2 * self.angular.solve(np.ascontiguousarray(rows))
-        field -= self.angular.response @ phi
-        of_plate = self._plate(np.zeros(1), field, phi) + self._of_means[:, None] * plate
+        field = self._theta2 * self.angular.solve(rows) - self.angular.response @ phi
+        of_plate = self.angular.plate(np.zeros(1), field.T, phi.T)[0].T
+        of_plate += self._of_means[:, None] * plate
         return field + self.terms[0] @ moved, of_plate + self.terms[1] @ moved
-
-    def _plate(self, y: np.ndarray, field: np.ndarray, phi: np.ndarray) -> np.ndarray:
-        """Return what readings, maps (K, k) and rotations (views, k) make of the plate."""
-        left = y - self.angular.gather(field) - phi[:, None]
-        return np.einsum("vk,vkp->kp", self.angular.relative_weight, left)
 
     @property
     def _of_terms(self) -> np.ndarray:

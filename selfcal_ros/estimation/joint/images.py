@@ -277,11 +277,6 @@ def _solved(system: NormalEquations,
     grid = system.grid
     y = np.zeros(grid.read.shape, dtype=complex)
     y[grid.read] = values
-    field, alone = system.alone(y)
-    plate, residual = grid.plate(y, field, alone)
-    moved = np.zeros(system.size)
-    moved[:len(alone)] = alone
-    moved -= system.gauge.parts(field) @ system.rigid[:4]
-    moved -= system.plate_gauge.parts(plate) @ system.rigid[4:]
-    in_datum = system.gauge.without(np.where(system.known_sites, field, 0).reshape(-1))
-    return residual, moved[:len(alone)], float((abs(in_datum)**2).sum())
+    field, parameters, _, residual = system.in_datum(y, *system.alone(y))
+    known = np.where(system.known_sites, field, 0)
+    return residual, parameters, float((abs(known)**2).sum())

@@ -347,8 +347,9 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations,
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
     weight = equations.line_weight * angular.weight
     rotations = found.ratio * found.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
-    followed = np.einsum("vk,vkp,vkq->pq", weight, columns, columns) * equations.free_inverse
-    return (float((weight * (found.residuals_theta - columns @ more) ** 2).sum()),
+    followed = np.einsum("vk,pvk,qvk->pq", weight, columns, columns) * equations.free_inverse
+    rest = found.residuals_theta - np.tensordot(more, columns, axes=1)
+    return (float((weight * rest**2).sum()),
             angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()))
 
 

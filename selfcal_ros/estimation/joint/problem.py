@@ -23,7 +23,7 @@ from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.normal.equations import NormalEquations, angular_residuals
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
@@ -527,13 +527,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
         parameters = inverse @ right
         field = (free - grid.response @ parameters[:n]).reshape(grid.views.shape)
 
-    parts = system.gauge.parts(field)
-    field = system.gauge.remove(field, parts)
-    parameters = parameters - parts @ system.rigid[:4]
-    plate, residuals = grid.plate(y, field, parameters[:n])
-    plate_parts = system.plate_gauge.parts(plate)
-    plate = system.plate_gauge.remove(plate, plate_parts)
-    parameters = parameters - plate_parts @ system.rigid[4:]
+    field, parameters, plate, residuals = system.in_datum(y, field, parameters)
     if problem.reference is not None:
         grown = scale_of(system, problem.reference, field=field, plate=plate,
                          half_width_m=length)
@@ -566,14 +560,12 @@ def angular_part(problem: Problem) -> AngularPart:
     if not angular.n_views:
         nothing = noise_estimate((float("nan"), 0), (float("nan"), 0), float("nan"))
         return AngularPart(np.full(angular.n_lines, np.nan), np.zeros(0), nothing)
-    free, d = angular.reduced(y)
-    phi = problem.system.angular_inverse @ d
-    _, residual = angular.plate(y, free - angular.response @ phi, phi)
+    residual = angular_residuals(problem.system, y)
     dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
     total = float((angular.weight * residual**2).sum())
     found = noise_estimate(problem.repeats_theta, sigma_of(total, dof),
                            problem.angular.sigma_declared, floor=FLOOR)
-    return AngularPart(free, d, found)
+    return AngularPart(*angular.reduced(y), found)
 
 
 FAR = 0.02

@@ -156,10 +156,10 @@ class LatticeViews:
         out += _taken(marks, self._mark_on[index]) * self.phases[index]
 
     def scatter(self, marks: np.ndarray) -> np.ndarray:
-        """Return the adjoint of `gather`: the sum over views at every site, complex (nx, ny)."""
-        out = np.zeros(self.shape, dtype=complex)
-        for index, one in enumerate(marks):
-            self.add_scattered(out, index, one)
+        """Return the adjoint of `gather`: sums over views at every site, complex (..., nx, ny)."""
+        out = np.zeros((*marks.shape[:-3], *self.shape), dtype=complex)
+        for index in range(len(self.poses)):
+            self.add_scattered(out, index, marks[..., index, :, :])
         return out
 
 

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import csr_matrix
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
@@ -37,6 +37,7 @@ from selfcal_ros.estimation.normal.angular import (
     AngularSystem,
     HarmonicSystem,
 )
+from selfcal_ros.estimation.normal.eliminated import over_nodes
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
@@ -144,9 +145,28 @@ class NormalEquations:
 
     def alone(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return map and misalignments of grid readings `y` fitted alone, in no datum."""
-        free, d = self.grid.reduced(y)
-        parameters = self.grid_inverse @ d
-        return (free - self.grid.response @ parameters).reshape(self.grid.views.shape), parameters
+        field, parameters = self.grid.fitted(y, self.grid_inverse)
+        return field.reshape(self.grid.views.shape), parameters
+
+    def in_datum(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return a solution in its datum: map, misalignments, plate and residuals.
+
+        Parameters
+        ----------
+        y : complex array (views, nx, ny)
+            Grid readings.
+        field, parameters : complex array (nx, ny), float array (size,) or (3 views,)
+            Their map and misalignments, in no datum.
+        """
+        parts = self.gauge.parts(field)
+        field = self.gauge.remove(field, parts)
+        rigid = self.rigid[:, :len(parameters)]
+        parameters = parameters - parts @ rigid[:len(parts)]
+        plate, residuals = self.grid.plate(y, field, parameters[:3 * self.grid.n_views])
+        parts = self.plate_gauge.parts(plate)
+        return (field, parameters - parts @ rigid[4:], self.plate_gauge.remove(plate, parts),
+                residuals)
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
@@ -169,9 +189,7 @@ class NormalEquations:
     @cached_property
     def rank_grid(self) -> int:
         """Rank of the grid readings (method eq. 6.1)."""
-        parts = self.grid.components
-        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        return int(2 * (nodes - np.count_nonzero(parts.balanced)) + self.rank_schur)
+        return 2 * self.grid.rank + self.rank_schur
 
     @cached_property
     def rank_angular(self) -> int:
@@ -255,7 +273,7 @@ class NormalEquations:
     @property
     def unchecked_sites(self) -> np.ndarray:
         """Known sites that depend on unchecked readings, bool (nx, ny)."""
-        return self.grid.unchecked & self.known_sites
+        return self.grid.unchecked.reshape(self.known_sites.shape) & self.known_sites
 
     @property
     def unchecked_lines(self) -> np.ndarray:
@@ -266,16 +284,11 @@ class NormalEquations:
     def known_views(self) -> np.ndarray:
         """Misalignments determined up to the datum, bool (size,)."""
         known = np.ones(self.size, dtype=bool)
-        n, shape = 3 * self.grid.n_views, self.grid.views.shape
-        nothing = np.zeros(self.grid.weight.shape)
+        n, nothing = 3 * self.grid.n_views, np.zeros(self.grid.weight.shape)
         for column in self.unseen.T:
             # an unseen mode may contain rigid parts: take it in the datum
-            field = -(self.grid.response @ column[:n]).reshape(shape)
-            parts = self.gauge.parts(field)
-            moved = column - parts @ self.rigid[:4]
-            plate, _ = self.grid.plate(nothing, self.gauge.remove(field, parts), moved[:n])
-            moved = moved - self.plate_gauge.parts(plate) @ self.rigid[4:]
-            known &= abs(moved) <= TRACE
+            field = -(self.grid.response @ column[:n]).reshape(self.grid.views.shape)
+            known &= abs(self.in_datum(nothing, field, column)[1]) <= TRACE
         return known & (self._turn_of_lines == 0) if self.apart else known
 
     @cached_property
@@ -377,9 +390,7 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     angular = system.angular
     if not angular.n_views:
         return np.zeros(y.shape)
-    free, d = angular.reduced(y)
-    phi = system.angular_inverse @ d
-    return angular.plate(y, free - angular.response @ phi, phi)[1]
+    return angular.plate(y, *angular.fitted(y, system.angular_inverse))[1]
 
 
 CORE = 0.75
@@ -456,12 +467,18 @@ class PlacedSystem(GridSystem):
     """
 
     views: PlacedViews
+    smooth = True
 
     def __init__(self, plate: Artifact, poses: tuple[PlacedPose, ...], weight: np.ndarray,
                  spline: MapSpline | None = None, rotations: tuple[int, ...] = (), *,
                  known_plate: bool = False) -> None:
         super().__init__((), weight, rotations=rotations, known_plate=known_plate)
         self.views = PlacedViews(plate, poses, spline)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Nodes of the map along x and y."""
+        return self.views.shape
 
     @cached_property
     def components(self) -> Components:
@@ -473,11 +490,6 @@ class PlacedSystem(GridSystem):
                                  self.mark_read.ravel() & (not self.known_plate))
 
     @cached_property
-    def unchecked(self) -> np.ndarray:
-        """No node: each has several readings around it, bool (cx, cy)."""
-        return np.zeros(self.views.shape, dtype=bool)
-
-    @cached_property
     def matrix(self) -> np.ndarray:
         """The matrix over the nodes, marks eliminated, complex (n, n).
 
@@ -487,15 +499,16 @@ class PlacedSystem(GridSystem):
         if n > MAX_NODES:
             raise InputError("map grid_size", f"{n} nodes are more than {MAX_NODES}",
                              "give the map fewer nodes")
-        own, meant = csr_matrix((n, n)), csr_matrix((self.n_marks, n), dtype=complex)
-        for rows, phase, weight, part in zip(self.views.rows, self.views.phases, self.weight,
-                                             self.relative_weight, strict=True):
-            own = own + rows.T @ diags(weight.ravel()) @ rows
-            meant = meant + diags(part.ravel() * phase.conjugate()) @ rows
-        total = diags(self.weight.sum(axis=0).ravel())
-        out = self.views.spline.on_nodes((own - meant.conj().T @ total @ meant).toarray())
+        out = self.views.spline.on_nodes(self._over_coefficients[0].toarray())
         out[np.diag_indices(n)] += self.vague
         return out
+
+    @cached_property
+    def _over_coefficients(self) -> tuple[csr_matrix, csr_matrix]:
+        """The matrix over the spline's coefficients, and the rows of the means of the marks."""
+        rows = [phase.conjugate() * one
+                for phase, one in zip(self.views.phases, self.views.rows, strict=True)]
+        return over_nodes(rows, self.weight, self.relative_weight)
 
     @property
     def vague(self) -> float:
@@ -515,10 +528,7 @@ class PlacedSystem(GridSystem):
     @cached_property
     def variance_of_means(self) -> np.ndarray:
         """Variance of the mean stage error at the sites of each mark, (marks,), likewise."""
-        views = self.views
-        rows = csr_matrix((self.n_marks, self.n_sites), dtype=complex)
-        for one, phase, part in zip(views.rows, views.phases, self.relative_weight, strict=True):
-            rows = rows + diags(part.ravel() * phase.conjugate()) @ one
+        views, rows = self.views, self._over_coefficients[1].tocsr()
         inverse = self.factor.inverse.reshape(self.n_sites, *views.shape)
         half = views.spline.coefficients(inverse).reshape(self.n_sites, -1)
         cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(

@@ -1,30 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Normal equations of the grid readings with the plate eliminated (method eqs. 4.3-4.5).
 
-The plate's error at a mark is the weighted mean of the residuals of its readings, so eliminating
-it is exact and local. The remaining equations couple the stage error G at the sites that one mark
-visits, and three numbers per view (phi, Re tau, Im tau), which are eliminated last.
+They couple the stage error G at the sites that one mark visits, and three numbers per view (phi,
+Re tau, Im tau), which are eliminated last.
 """
 
-import math
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from scipy.linalg import helmert
 
-from selfcal_ros.estimation.lattice.connectivity import (
-    Components,
-    components,
-    free_turns,
-    rest_on_one,
-)
+from selfcal_ros.estimation.lattice.connectivity import free_turns
 from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews, rigid_parameters
 from selfcal_ros.estimation.multifrontal.factor import Factor, fold
+from selfcal_ros.estimation.normal.eliminated import PlateEliminated
 from selfcal_ros.model.pose import LatticePose
 
 
-class GridSystem:
+class GridSystem(PlateEliminated):
     """Normal equations of a set of grid readings, independent of their values.
 
     Parameters
@@ -42,35 +36,13 @@ class GridSystem:
         Whether the plate is known, so that no mark is eliminated.
     """
 
+    coordinates = 2
+
     def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: float = 0,
                  rotations: tuple[int, ...] = (), *, known_plate: bool = False) -> None:
-        self.weight, self.rotations, self.known_plate = weight, rotations, known_plate
+        super().__init__(weight, known_plate=known_plate)
+        self.rotations = rotations
         self.views = LatticeViews(weight.shape[1:], poses, unit)
-        self.read = weight > 0
-        total = weight.sum(axis=0)
-        self.mark_read = total > 0
-        self.relative_weight = weight / np.where(self.mark_read, total, 1.0) * (not known_plate)
-        """Share of each reading in the mean of its mark, (views, nx, ny) (method eq. 4.3)."""
-
-    @property
-    def n_views(self) -> int:
-        """Number of grid views."""
-        return len(self.views.poses)
-
-    @property
-    def n_sites(self) -> int:
-        """Number of sites of the field."""
-        return math.prod(self.views.shape)
-
-    @property
-    def n_marks(self) -> int:
-        """Number of marks of the plate."""
-        return self.weight[0].size
-
-    @property
-    def n_readings(self) -> int:
-        """Number of marks read, over all views; each has two coordinates."""
-        return int(np.count_nonzero(self.read))
 
     @cached_property
     def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -80,26 +52,9 @@ class GridSystem:
         return site, mark, np.array([pose.q for pose in self.views.poses])[view]
 
     @cached_property
-    def components(self) -> Components:
-        """Components of the graph of sites and marks."""
-        site, mark, q = self.edges
-        if self.known_plate:
-            return Components.of_one(np.isin(np.arange(self.n_sites), site),
-                                     np.zeros(self.n_marks, dtype=bool))
-        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks,
-                          turning=self._find_turning_site())
-
-    @cached_property
     def free_turns(self) -> tuple[np.ndarray, np.ndarray]:
         """Quarter turns of the free vectors of components at sites and marks, int (sites,) each."""
         return free_turns(*self.edges, self.components)
-
-    @cached_property
-    def unchecked(self) -> np.ndarray:
-        """Sites that depend on unchecked readings, bool (nx, ny)."""
-        site, mark, _ = self.edges
-        return rest_on_one(site, mark, n_sites=self.n_sites,
-                           n_marks=self.n_marks).reshape(self.views.shape)
 
     def _find_turning_site(self) -> int:
         """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
@@ -111,20 +66,6 @@ class GridSystem:
                 if same.any():
                     return int(self.views.site_index[i].ravel()[same.argmax()])
         return -1
-
-    def centred(self, marks: np.ndarray) -> np.ndarray:
-        """Return `marks` (views, nx, ny) minus the weighted mean of each mark over its views."""
-        mean = self.relative_weight[0] * marks[0]
-        for relative_weight, mark in zip(self.relative_weight[1:], marks[1:], strict=True):
-            mean += relative_weight * mark
-        return marks - mean
-
-    @cached_property
-    def pins(self) -> np.ndarray:
-        """The pinned sites: those never visited, and one of each free component."""
-        parts = self.components
-        held = parts.first_sites[parts.balanced]
-        return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
 
     @cached_property
     def factor(self) -> Factor:
@@ -194,7 +135,7 @@ class GridSystem:
         return normal
 
     @cached_property
-    def block(self) -> np.ndarray:
+    def block(self) -> np.ndarray:  # type: ignore[override]
         """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
         x, y = self.views.z.real.ravel(), self.views.z.imag.ravel()
         moments = np.stack([x * x + y * y, x, y, np.ones_like(x)], axis=1)
@@ -210,34 +151,37 @@ class GridSystem:
         return self.tied(out.reshape(3 * self.n_views, -1))
 
     @cached_property
-    def response(self) -> np.ndarray:
+    def response(self) -> np.ndarray:  # type: ignore[override]
         """M^-1 times `columns`: response of the sites to phi, Re tau, Im tau, (sites, 3 views)."""
-        solved = self.factor.solve(np.ascontiguousarray(self.columns.T))
+        solved = self.solve(self.columns.T)
         return _real_columns(solved.reshape(self.n_sites, self.n_views, 2))
-
-    @cached_property
-    def schur(self) -> np.ndarray:
-        """Normal matrix of the misalignments alone, (3 views, 3 views) (method eq. 4.5)."""
-        out = self.tied(self.block - self.coupled(self.response))
-        return (out + out.T) / 2
 
     @cached_property
     def rigid(self) -> np.ndarray:
         """The datum modes in terms of the misalignments, (7, 3 views)."""
         return rigid_parameters(self.views).reshape(7, -1)
 
-    def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the right-hand sides of sites (complex) and misalignments (real)."""
-        weighted = self.weight * self.centred(y)
-        shapes = self.shapes.reshape(2, -1)
-        sums = (shapes @ weighted.conj().reshape(self.n_views, -1).T).conj()
-        return self.views.scatter(weighted).ravel(), of_misalignments(sums.T.ravel())
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return M^-1 of right-hand sides, complex (sites,) or (sites, k)."""
+        return self.factor.solve(np.ascontiguousarray(right))
 
-    def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
-        b, d = self.right_side(y)
-        free = self.factor.solve(b)
-        return free, d - self.coupled(free)
+    def gather(self, field: np.ndarray) -> np.ndarray:
+        """Return maps, complex (sites,) or (..., nx, ny), at the marks, (..., views, nx, ny)."""
+        return self.views.gather(field.reshape(self.views.shape) if field.ndim == 1 else field)
+
+    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+        """Return the covariances of the map at marks of one and another view, (nx, ny)."""
+        site, phase = np.maximum(self.views.site_index, 0), self.views.phases
+        return phase[one].conj() * matrix[site[one], site[other]] * phase[other]
+
+    def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return sums of readings (k, views, nx, ny) at sites, (sites, k), and over misalignments.
+
+        The latter as phi, Re tau, Im tau of each view, (3 views, k).
+        """
+        sums = np.tensordot(self.shapes.conj(), readings, axes=([1, 2], [2, 3]))
+        return (self.views.scatter(readings).reshape(len(readings), -1).T,
+                of_misalignments(sums.transpose(2, 0, 1).reshape(2 * self.n_views, -1)))
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return phi i z + tau at every mark, complex (..., views, nx, ny), from (..., 3 views)."""
@@ -271,12 +215,6 @@ class GridSystem:
         field.ravel()[sites] += PHASES[at_site[sites]] * mean[parts.of_site[sites]]
         plate.ravel()[marks] -= unit * mean[part]
         return field, plate
-
-    def plate(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray) -> tuple:
-        """Return A (..., nx, ny) and the residuals (..., views, nx, ny) for G and misalignments."""
-        residual = y - self.views.gather(field) - self.misaligned(parameters)
-        a = np.einsum("vij,...vij->...ij", self.relative_weight, residual)
-        return a, np.where(self.read, residual - a[..., None, :, :], 0.0)
 
 
 def of_misalignments(sums: np.ndarray) -> np.ndarray:

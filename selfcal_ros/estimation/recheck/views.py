@@ -325,9 +325,7 @@ def map_of_lines(lines: AngularSystem, y: np.ndarray, columns: LineColumns, effe
     fields, _, left = effects.projected(lines_eliminated(lines, columns), lines.response, inverse,
                                         variance)
     y = y - np.tensordot(effects.mean, columns.values, axes=1)
-    free, right = lines.reduced(y)
-    phi = inverse @ right
-    field = free - lines.response @ phi
+    field, phi = lines.fitted(y, inverse)
     shown = left @ effects.covariance @ columns.sums(
         lines.weight * lines.plate(y, field, phi)[1]) / variance
     centre = np.eye(lines.n_lines)[:, known]

@@ -146,13 +146,12 @@ class ProjectedColumns:
 
     def of_lines(self, system: NormalEquations, lines: LineColumns,
                  half_width_m: float) -> np.ndarray:
-        """Return the angular residuals of the columns, (views, K, p), rad."""
-        angular = system.angular
-        phi = self.parameters[system.phi_at] / half_width_m
-        out = angular.gather(self.turned) - phi[:, None]
+        """Return the angular residuals of the columns, (p, views, K), rad."""
+        y = np.zeros((len(self.gram), *system.angular.weight.shape))
         if len(lines.at):
-            out[:, :, lines.at] += np.moveaxis(lines.values, 0, -1)
-        return np.where(angular.read[:, :, None], angular.centred(out), 0.0)
+            y[lines.at] = lines.values
+        phi = self.parameters[system.phi_at] / half_width_m
+        return system.angular.plate(y, -self.turned.T, phi.T)[1]
 
 
 def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
@@ -194,12 +193,11 @@ def lines_eliminated(angular: AngularSystem,
     """
     if not len(lines.at):
         return np.zeros((angular.n_lines, 0)), np.zeros((angular.n_views, 0)), np.zeros((0, 0))
-    values = np.moveaxis(lines.values, 0, -1)
-    weighted = angular.weight[:, :, None] * angular.centred(values)
-    lines_right = angular.scatter(weighted)
-    free = angular.solve(lines_right)
-    gram = np.einsum("vkp,vkq->pq", values, weighted) - lines_right.T @ free
-    return free, weighted.sum(axis=1) - angular.columns.T @ free, (gram + gram.T) / 2
+    weighted = angular.weight * angular.centred(lines.values)
+    of_sites, of_rotations = angular.adjoint(weighted)
+    free = angular.solve(of_sites)
+    gram = np.einsum("pvk,qvk->pq", lines.values, weighted) - of_sites.T @ free
+    return free, of_rotations - angular.coupled(free), (gram + gram.T) / 2
 
 
 OVER_NOISE = 100.0

@@ -7,7 +7,6 @@ h = w (1/W + var(x - mean x)), with x the part of the model other than the plate
 coordinates share a 2 x 2 matrix h + (a, b; b, -a): `skew` is a + ib, which rotations make.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,59 +95,41 @@ class Alone:
 
 def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> Alone:
     """Return the grid readings y, complex (views, nx, ny), m, fitted by themselves."""
-    redundancy, skew = exact_leverage(system) if exact else (drawn_redundancy(system), 0j)
+    redundancy, skew = exact_leverage(system.grid, system.grid_inverse) if exact else (
+        drawn_redundancy(system), np.zeros(y.shape))
     return Alone("grid", grid_residuals(system, y), system.grid.weight, redundancy,
-                 2 * system.grid.n_readings - system.rank_grid,
-                 skew + np.zeros_like(redundancy))
+                 2 * system.grid.n_readings - system.rank_grid, skew)
 
 
 def lines_alone(system: NormalEquations, y: np.ndarray) -> Alone:
     """Return the readings of lines y, (views, K), rad, fitted by themselves."""
-    redundancy = angular_redundancy(system)
-    return Alone("angular", angular_residuals(system, y), system.angular.weight, redundancy,
-                 system.angular.n_readings - system.rank_angular, np.zeros_like(redundancy))
+    return Alone("angular", angular_residuals(system, y), system.angular.weight,
+                 angular_redundancy(system), system.angular.n_readings - system.rank_angular,
+                 np.zeros(y.shape))
 
 
-def exact_leverage(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 - h and the skew of every grid reading, (views, nx, ny)."""
-    grid = system.grid
-    inverse = grid.factor.solve(np.eye(grid.n_sites, dtype=complex))
-    index = np.maximum(grid.views.site_index, 0)
-    basis = np.array([grid.centred(grid.views.gather(-column.reshape(grid.views.shape))
-                                   + grid.misaligned(unit)) for column, unit in
-                      zip(grid.response.T, np.eye(3 * grid.n_views), strict=True)])
-    answer = np.einsum("pq,qvij->pvij", system.grid_inverse, basis)
-    skew = np.einsum("pvij,pvij->vij", basis, answer) / 2
-    return _redundancy(grid, grid.views.phases.conj(), lambda i, j: inverse[index[i], index[j]],
-                       np.einsum("pvij,pvij->vij", np.conj(basis), answer).real / 2), (
-        grid.weight * skew)
+def exact_leverage(part: GridSystem | AngularSystem,
+                   misaligned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return 1 - h and the skew of every reading of one kind, (views, *marks).
 
-
-def _redundancy(part: GridSystem | AngularSystem, turns: np.ndarray,
-                entry: Callable[[int, int], np.ndarray], spread: np.ndarray) -> np.ndarray:
-    """Return 1 - h of every reading of one kind.
-
-    Parameters
-    ----------
-    part : GridSystem or AngularSystem
-        The readings.
-    turns : array (views,)
-        Factors from the map to the readings of each view.
-    entry : callable
-        Covariances of the map at the places of each mark in one and another view.
-    spread : float array (views, ...)
-        Variance of the readings that the misalignments of the views make.
+    `misaligned` is the covariance of the misalignments for unit noise of these readings alone.
     """
     weight, total = part.weight, part.weight.sum(axis=0)
+    inverse = part.solve(np.eye(part.n_sites))
     variance = np.zeros(weight.shape)
     for v in range(part.n_views):
-        own = -part.relative_weight * turns.reshape(-1, *[1] * total.ndim)
-        own[v] += turns[v]
+        own = -part.relative_weight
+        own[v] += 1
         for i in range(part.n_views):
             for j in range(part.n_views):
-                variance[v] += np.real(own[i] * entry(i, j) * np.conj(own[j]))
+                variance[v] += np.real(own[i] * part.covariance(inverse, i, j) * own[j])
+    maps = part.response.T.reshape(len(misaligned), *part.shape)
+    basis = part.centred(part.misaligned(np.eye(len(misaligned))) - part.gather(maps))
+    answer = np.tensordot(misaligned, basis, axes=1)
+    spread = (np.conj(basis) * answer).real.sum(axis=0) / part.coordinates
     h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))
-    return np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0)
+    return (np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0),
+            weight * (basis * answer).sum(axis=0) / part.coordinates)
 
 
 def drawn_redundancy(system: NormalEquations) -> np.ndarray:
@@ -170,12 +151,7 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
     if angular.n_lines > MAX_FULL:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
-    inverse = angular.solve(np.eye(angular.n_lines))
-    basis = np.array([angular.centred(unit[:, None] - angular.gather(column)) for column, unit in
-                      zip(angular.response.T, np.eye(angular.n_views), strict=True)])
-    return _redundancy(angular, np.ones(angular.n_views),
-                       lambda i, j: angular.covariance(inverse, i, j),
-                       np.einsum("pvk,pq,qvk->vk", basis, system.angular_inverse, basis))
+    return exact_leverage(angular, system.angular_inverse)[0]
 
 
 def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:

@@ -186,7 +186,7 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
     finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
     fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
     more = fine.n_told - coarse.n_told
-    dof = coarse.n_readings - coarse.n_marks - fine.n_told - (coarse.n_views - 1)
+    dof = coarse.n_readings - int(coarse.mark_read.sum()) - fine.n_told - (coarse.n_views - 1)
     if more < 1 or dof < 1:
         return None
     (before, coarse_map), (rest, fine_map) = (_fitted_lines(one, y) for one in (coarse, fine))
@@ -198,9 +198,7 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
 
 def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the squares of residuals of lines fitted alone, and their map without its mean."""
-    free, d = lines.reduced(y)
-    phi = np.linalg.pinv(lines.schur, rcond=GAP, hermitian=True) @ d
-    field = free - lines.response @ phi
+    field, phi = lines.fitted(y, np.linalg.pinv(lines.schur, rcond=GAP, hermitian=True))
     rest = lines.plate(y, field, phi)[1]
     return float((lines.weight * rest**2).sum()), field - field.mean()
 

@@ -374,7 +374,7 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
 def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     """Some are not read; the plate is known with a dense covariance, and a term has a size."""
     rng, count, sigma, turns = np.random.default_rng(8), 7, 2e-6, (0, 3)
-    weight = rng.integers(1, 4, (2, count)) * (rng.random((2, count)) < 0.8)
+    weight = rng.integers(1, 4, (2, count)).astype(float) * (rng.random((2, count)) < 0.8)
     root, y = 3e-6 * rng.normal(size=(2 * count, count)), 1e-5 * rng.normal(size=(2, count))
     before, of_term, plate = root @ root.T, rng.normal(size=(2, count)), 1e-5 * rng.normal(
         size=count)

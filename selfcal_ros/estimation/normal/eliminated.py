@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readings of one kind, marks or lines, with the plate eliminated (method eqs. 4.3-4.5).
+
+The plate's error at a mark is the weighted mean of the residuals of its readings, so eliminating
+it is exact and local. The remaining equations couple the map at the sites that one mark visits, and
+the misalignments of the views, which are eliminated last.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_matrix, diags
+
+from selfcal_ros.estimation.lattice.connectivity import Components, components, rest_on_one
+
+
+class PlateEliminated(ABC):
+    """Normal equations of readings of one kind, independent of their values.
+
+    Parameters
+    ----------
+    weight : float array (views, *marks)
+        Weight of each reading; 0 = not read.
+    known_plate : bool
+        Whether the plate is known, so that no mark is eliminated.
+    """
+
+    response: np.ndarray
+    """M^-1 times the coupling to the misalignments: their effect on the map, (sites, p)."""
+
+    block: np.ndarray
+    """Block of the misalignments, plate eliminated, (p, p)."""
+
+    coordinates: int
+    """Numbers of one reading: two of a mark, one of a line."""
+
+    smooth = False
+    """Whether the map has values between its sites, so that no site rests on one reading."""
+
+    def __init__(self, weight: np.ndarray, *, known_plate: bool) -> None:
+        self.weight, self.known_plate = weight, known_plate
+        self.read = weight > 0
+        total = weight.sum(axis=0)
+        self.mark_read = total > 0
+        self.relative_weight = weight / np.where(self.mark_read, total, 1.0) * (not known_plate)
+        """Share of each reading in the mean of its mark, (views, *marks) (method eq. 4.3)."""
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.weight)
+
+    @property
+    def n_marks(self) -> int:
+        """Number of marks of the plate, or of its lines."""
+        return self.mark_read.size
+
+    @property
+    def n_sites(self) -> int:
+        """Number of sites of the map."""
+        return math.prod(self.shape)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the map: that of the marks, unless it has nodes of its own."""
+        return self.mark_read.shape
+
+    @property
+    def n_readings(self) -> int:
+        """Number of marks read, over all views."""
+        return int(np.count_nonzero(self.read))
+
+    @property
+    def noise_of_means(self) -> np.ndarray:
+        """Variance of the mean of the readings of each mark, (marks,); 0 where not read."""
+        total = self.weight.sum(axis=0).ravel()
+        return np.where(total > 0, 1 / np.where(total > 0, total, 1.0), 0.0)
+
+    @property
+    @abstractmethod
+    def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Site, mark and quarter turns of every reading."""
+
+    @cached_property
+    def components(self) -> Components:
+        """Components of the graph of sites and marks."""
+        site, mark, q = self.edges
+        if self.known_plate:
+            return Components.of_one(np.isin(np.arange(self.n_sites), site),
+                                     np.zeros(self.n_marks, dtype=bool))
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks,
+                          turning=self._find_turning_site())
+
+    def _find_turning_site(self) -> int:
+        """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
+        return -1
+
+    @property
+    def rank(self) -> int:
+        """Rank of one coordinate of the readings with known misalignments (method eq. 6.1)."""
+        parts = self.components
+        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
+        return int(nodes - np.count_nonzero(parts.balanced))
+
+    @cached_property
+    def unchecked(self) -> np.ndarray:
+        """Sites that depend on unchecked readings, bool (sites,)."""
+        if self.smooth:
+            return np.zeros(self.n_sites, dtype=bool)
+        site, mark, _ = self.edges
+        return rest_on_one(site, mark, n_sites=self.n_sites, n_marks=self.n_marks)
+
+    @cached_property
+    def pins(self) -> np.ndarray:
+        """The pinned sites: those never visited, and one of each free component."""
+        parts = self.components
+        held = parts.first_sites[parts.balanced]
+        return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
+
+    @abstractmethod
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return M^-1 of right-hand sides, (sites,) or (sites, k)."""
+
+    @abstractmethod
+    def gather(self, field: np.ndarray) -> np.ndarray:
+        """Return maps at the marks of each view, frame of the readings, (..., views, *marks)."""
+
+    @abstractmethod
+    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+        """Return the covariances of a map at the marks of one and another view, (*marks,).
+
+        `matrix` is that of the map, (sites, sites); the frame is that of the readings.
+        """
+
+    @abstractmethod
+    def misaligned(self, parameters: np.ndarray) -> np.ndarray:
+        """Return what misalignments (..., p) make of the readings, (..., views, *marks)."""
+
+    @abstractmethod
+    def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return sums of readings (k, views, *marks) at the sites, and over the misalignments.
+
+        The adjoint of `gather` and `misaligned`, (sites, k) and (p, k).
+        """
+
+    @abstractmethod
+    def coupled(self, fields: np.ndarray) -> np.ndarray:
+        """Return the coupling of fields (sites, ...) to the misalignments, (p, ...)."""
+
+    def tied(self, normal: np.ndarray) -> np.ndarray:
+        """Return a normal matrix of misalignments without those that are one."""
+        return normal
+
+    @cached_property
+    def schur(self) -> np.ndarray:
+        """Normal matrix of the misalignments alone, (p, p) (method eq. 4.5)."""
+        out = self.tied(self.block - self.coupled(self.response))
+        return (out + out.T) / 2
+
+    def means(self, y: np.ndarray) -> np.ndarray:
+        """Return the weighted mean of each mark over its views, (..., 1, *marks)."""
+        return (self.relative_weight * y).sum(axis=-self.weight.ndim, keepdims=True)
+
+    def centred(self, y: np.ndarray) -> np.ndarray:
+        """Return `y` (..., views, *marks) minus the weighted mean of each mark over its views."""
+        return y - self.means(y)
+
+    def right_side(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the right-hand sides of sites, (sites,), and misalignments, (p,), of readings."""
+        sites, misalignments = self.adjoint((self.weight * self.centred(y))[None])
+        return sites[:, 0], misalignments[:, 0]
+
+    def reduced(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M^-1 b and the right-hand side of the misalignments with sites eliminated."""
+        b, d = self.right_side(y)
+        free = self.solve(b)
+        return free, d - self.coupled(free)
+
+    def fitted(self, y: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return map, (sites,), and misalignments, (p,), of readings fitted alone, in no datum.
+
+        `inverse` is the pseudo-inverse of `schur`.
+        """
+        free, d = self.reduced(y)
+        parameters = inverse @ d
+        return free - self.response @ parameters, parameters
+
+    def plate(self, y: np.ndarray, field: np.ndarray,
+              parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the plate (..., *marks) and the residuals for a map and misalignments.
+
+        The residuals, (..., views, *marks), are 0 where not read.
+        """
+        residual = y - self.gather(field) - self.misaligned(parameters)
+        a = self.means(residual)
+        out = np.where(self.read, residual - a, 0.0)
+        return a.squeeze(axis=-self.weight.ndim), out
+
+    def functionals(self, sites: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return functionals of map and plate as those of the sites and the misalignments.
+
+        But for the noise of the means of the marks, whose factors are `marks`.
+
+        Parameters
+        ----------
+        sites, marks : array (sites, k) and (marks, k)
+            Factors of both maps; real inner product.
+
+        Returns
+        -------
+        array (sites, k), float array (p, k)
+        """
+        taken = np.zeros((len(self.response.T), sites.shape[1]))
+        if marks.any():
+            each = marks.T.reshape(-1, 1, *self.weight.shape[1:])
+            of_sites, taken = self.adjoint(self.relative_weight * each)
+            sites = sites - of_sites
+        return sites, -taken - np.real(self.response.conj().T @ sites)
+
+
+def over_nodes(rows: Sequence[csr_matrix | np.ndarray], weight: np.ndarray,
+               relative_weight: np.ndarray) -> tuple[csr_matrix, csr_matrix]:
+    """Return the matrix over the nodes with the marks eliminated, and the rows of their means.
+
+    Parameters
+    ----------
+    rows : sequence of matrix (marks, nodes)
+        From the map to the readings of each view.
+    weight, relative_weight : float array (views, *marks)
+        Weights, and shares in the mean of a mark.
+    """
+    count = len(rows)
+    own = sum(row.conj().T @ (diags(one) @ row)
+              for row, one in zip(rows, weight.reshape(count, -1), strict=True))
+    mean = sum(diags(part) @ row
+               for row, part in zip(rows, relative_weight.reshape(count, -1), strict=True))
+    return own - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean
