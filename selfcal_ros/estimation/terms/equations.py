@@ -564,6 +564,13 @@ def next_coefficients(equations: TermEquations, found: Score, coefficients: np.n
     return coefficients + inverse @ (right - prior * coefficients)
 
 
+def root_of(covariance: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return a root (p, k) of the part of a covariance that is gone if `rows` are known."""
+    values, vectors = np.linalg.eigh(covariance[np.ix_(rows, rows)])
+    determined = values > ROUNDED * max(values[-1], 0.0)
+    return covariance[:, rows] @ (vectors[:, determined] / np.sqrt(values[determined]))
+
+
 def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
     """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
 
@@ -573,10 +580,7 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     rest, out = covariance.copy(), []
     sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
     for name in sized:
-        at = columns.rows([name])
-        values, vectors = np.linalg.eigh(rest[np.ix_(at, at)])
-        determined = values > ROUNDED * max(values[-1], 0.0)
-        root = rest[:, at] @ (vectors[:, determined] / np.sqrt(values[determined]))
+        root = root_of(rest, columns.rows([name]))
         rest = rest - root @ root.T
         out.append((str(name), root))
     own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
