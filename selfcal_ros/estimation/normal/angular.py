@@ -48,7 +48,7 @@ class AngularSystem(PlateEliminated):
         Whether the plate is known, so that none of its lines is eliminated.
     """
 
-    coordinates = 1
+    coordinates, of_view = 1, 1
 
     def __init__(self, turns: tuple[float, ...], weight: np.ndarray, *,
                  known_plate: bool = False) -> None:
@@ -115,26 +115,6 @@ class AngularSystem(PlateEliminated):
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return what phi, (..., views), makes of the lines, (..., views, 1)."""
         return parameters[..., None]
-
-    @cached_property
-    def _of_rotations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coupling of the stage lines, (K, views), and of phi, (views, views), to phi."""
-        return self.adjoint(self.weight * self.centred(self.misaligned(np.eye(self.n_views))))
-
-    @property
-    def block(self) -> np.ndarray:  # type: ignore[override]
-        """Block of phi, plate eliminated, (views, views)."""
-        return self._of_rotations[1]
-
-    @cached_property
-    def response(self) -> np.ndarray:  # type: ignore[override]
-        """M^-1 times the coupling of the stage lines to phi, (K, views)."""
-        coupling = self._of_rotations[0]
-        return self.solve(coupling) if self.n_views else coupling
-
-    def coupled(self, fields: np.ndarray) -> np.ndarray:
-        """Return the coupling of maps (K, ...) to phi, (views, ...)."""
-        return self._of_rotations[0].T @ fields
 
 
 KNOWN = 3.0

@@ -28,14 +28,11 @@ class PlateEliminated(ABC):
         Whether the plate is known, so that no mark is eliminated.
     """
 
-    response: np.ndarray
-    """M^-1 times the coupling to the misalignments: their effect on the map, (sites, p)."""
-
-    block: np.ndarray
-    """Block of the misalignments, plate eliminated, (p, p)."""
-
     coordinates: int
     """Numbers of one reading: two of a mark, one of a line."""
+
+    of_view: int
+    """Misalignments of one view: phi, Re tau, Im tau of marks, phi of lines; p of all views."""
 
     smooth = False
     """Whether the map has values between its sites, so that no site rests on one reading."""
@@ -146,13 +143,38 @@ class PlateEliminated(ABC):
         The adjoint of `gather` and `misaligned`, (sites, k) and (p, k).
         """
 
-    @abstractmethod
-    def coupled(self, fields: np.ndarray) -> np.ndarray:
-        """Return the coupling of fields (sites, ...) to the misalignments, (p, ...)."""
-
     def tied(self, normal: np.ndarray) -> np.ndarray:
         """Return a normal matrix of misalignments without those that are one."""
         return normal
+
+    @cached_property
+    def _coupling(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coupling of sites, (sites, p), and misalignments, (p, p), to the misalignments."""
+        p = self.of_view * self.n_views
+        sites, block = np.zeros((self.n_sites, 0)), np.zeros((p, 0))
+        for unit in np.eye(p).reshape(self.n_views, self.of_view, p):
+            of_sites, of_views = self.adjoint(self.weight * self.centred(self.misaligned(unit)))
+            sites, block = np.hstack([sites, of_sites]), np.hstack([block, of_views])
+        return sites, self.tied(block)
+
+    @property
+    def coupling(self) -> np.ndarray:
+        """Coupling of the sites to the misalignments, plate eliminated, (sites, p)."""
+        return self._coupling[0]
+
+    @property
+    def block(self) -> np.ndarray:
+        """Normal matrix of the misalignments, plate eliminated, (p, p)."""
+        return self._coupling[1]
+
+    def coupled(self, fields: np.ndarray) -> np.ndarray:
+        """Return the coupling of fields (sites, ...) to the misalignments, (p, ...)."""
+        return np.real(self.coupling.conj().T @ fields)
+
+    @cached_property
+    def response(self) -> np.ndarray:
+        """M^-1 times `coupling`: response of the sites to the misalignments, (sites, p)."""
+        return self.solve(self.coupling) if self.n_views else self.coupling
 
     @cached_property
     def schur(self) -> np.ndarray:

@@ -36,7 +36,7 @@ class GridSystem(PlateEliminated):
         Whether the plate is known, so that no mark is eliminated.
     """
 
-    coordinates = 2
+    coordinates, of_view = 2, 3
 
     def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: float = 0,
                  rotations: tuple[int, ...] = (), *, known_plate: bool = False) -> None:
@@ -89,26 +89,6 @@ class GridSystem(PlateEliminated):
         return np.stack([1j * self.views.z, np.ones(self.views.plate_shape)])
 
     @cached_property
-    def columns(self) -> np.ndarray:
-        """Coupling of sites to phi and tau, complex (2 views, sites), plate eliminated."""
-        meant = self.relative_weight[:, None] * self.shapes
-        out = np.zeros((self.n_views, 2, *self.views.shape), dtype=complex)
-        for v, weight in enumerate(self.weight):
-            part = meant * -weight
-            part[v] += weight * self.shapes
-            self.views.add_scattered(out, v, part)
-        return out.reshape(2 * self.n_views, self.n_sites)
-
-    def coupled(self, fields: np.ndarray) -> np.ndarray:
-        """Return the adjoint coupling of fields (sites, ...) to phi, Re, Im tau, (3 views, ...)."""
-        return of_misalignments((self.columns @ fields.conj()).conj())
-
-    @property
-    def real_columns(self) -> np.ndarray:
-        """The coupling of sites to phi, Re tau, Im tau, complex (sites, 3 views)."""
-        return _real_columns(self.columns.T.reshape(self.n_sites, self.n_views, 2))
-
-    @cached_property
     def differences(self) -> np.ndarray:
         """Differences between rotations that are one, orthonormal (3 views, k)."""
         found = []
@@ -133,28 +113,6 @@ class GridSystem(PlateEliminated):
             normal[:n] -= apart @ (apart.T @ normal[:n])
             normal[:, :n] -= (normal[:, :n] @ apart) @ apart.T
         return normal
-
-    @cached_property
-    def block(self) -> np.ndarray:  # type: ignore[override]
-        """Block of the misalignments, plate eliminated, real (3 views, 3 views)."""
-        x, y = self.views.z.real.ravel(), self.views.z.imag.ravel()
-        moments = np.stack([x * x + y * y, x, y, np.ones_like(x)], axis=1)
-        out = np.zeros((self.n_views, 3, self.n_views, 3))
-        for v, weight in enumerate(self.weight):
-            w = self.relative_weight * -weight
-            w[v] += weight
-            # f = iz, 1, i: the inner products Re(conj(f) f') are |z|^2, -y, x, 1
-            zz, sx, sy, s = (w.reshape(self.n_views, -1) @ moments).T
-            out[v, 0, :, 0], out[v, 1, :, 1], out[v, 2, :, 2] = zz, s, s
-            out[v, 0, :, 1] = out[v, 1, :, 0] = -sy
-            out[v, 0, :, 2] = out[v, 2, :, 0] = sx
-        return self.tied(out.reshape(3 * self.n_views, -1))
-
-    @cached_property
-    def response(self) -> np.ndarray:  # type: ignore[override]
-        """M^-1 times `columns`: response of the sites to phi, Re tau, Im tau, (sites, 3 views)."""
-        solved = self.solve(self.columns.T)
-        return _real_columns(solved.reshape(self.n_sites, self.n_views, 2))
 
     @cached_property
     def rigid(self) -> np.ndarray:
@@ -222,9 +180,3 @@ def of_misalignments(sums: np.ndarray) -> np.ndarray:
     pairs = sums.reshape(-1, 2, *sums.shape[1:])
     parts = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
     return np.stack(parts, axis=1).reshape(-1, *sums.shape[1:])
-
-
-def _real_columns(pairs: np.ndarray) -> np.ndarray:
-    """Return (sites, views, 2) of phi and Re tau as (sites, 3 views): Im tau is i times Re tau."""
-    three = np.concatenate([pairs, 1j * pairs[..., 1:]], axis=-1)
-    return three.reshape(len(pairs), -1)

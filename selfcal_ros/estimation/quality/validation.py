@@ -43,8 +43,7 @@ from selfcal_ros.estimation.observability.plan_check import (
 )
 from selfcal_ros.estimation.observability.rank import identifies
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.columns import NO_LINES, shapes_in_full, term_columns
-from selfcal_ros.estimation.terms.equations import reduce_columns
+from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, noise_of
@@ -56,9 +55,6 @@ from selfcal_ros.model.view import Plan
 
 READINGS_DRAWN = 2_000_000
 """Largest number of readings in all draws together, 200 MB: larger fields vary less."""
-
-TOGETHER = 20_000
-"""Number of readings computed at once: several draws of a small field, one of a large one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +168,11 @@ def _fitted_placing(errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *,
         return np.nan, complex(np.nan)
     excess: np.ndarray | float = 0.0
     for _ in range(MAX_STEPS):  # each gains a factor of the rotation
-        phi, x, y = fitted_misalignment(marks, (errors - excess)[:, None])[:, 0]
+        phi, tau = fitted_misalignment(marks, errors - excess)
         before, excess = excess, rotation_excess(phi, marks, plate) * rigid
         if np.abs(excess - before).max() <= FLOOR:
             break
-    return float(phi), complex(x, y)
+    return phi, tau
 
 
 def line_errors(solved: Solved, held: AngularData) -> np.ndarray:
@@ -239,37 +235,27 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own = noise_of(rng, (n, *weight.shape), weight)
     own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, FLOOR)
-    views = maps_of(held.grid)
+    views, columns = maps_of(held.grid), np.zeros((0, *grid.weight.shape))
+    if model.equations is not None:
+        columns = model.equations.columns.grid
     squares = np.zeros(n)
-    step = max(TOGETHER // grid.weight.size, 1)
-    for draws in (slice(first, first + step) for first in range(0, n, step)):
-        field = fields[:, draws].T.reshape(-1, *grid.views.shape)
-        taken = noise[draws]
-        if model.equations is not None:
-            taken = taken - _of_terms(coefficients[:, draws], model.equations.columns.grid)
-        plate = grid.plate(taken, field, parameters[:, draws].T)[0]
-        misaligned = grid.misaligned(parameters[:, draws].T)
-        error = own[draws] - views.gather(field) - plate[:, None]
-        if len(coefficients):
-            error = error - _of_terms(coefficients[:, draws], held.columns)
-        if len(held.own):
-            error = error + _of_terms(own_terms[:, draws], held.own)
-        for row, fitted in enumerate(held.rows):
+    for draw in range(n):
+        field = fields[:, draw].reshape(grid.views.shape)
+        taken = noise[draw] - np.tensordot(coefficients[:, draw], columns, axes=1)
+        plate = grid.plate(taken, field, parameters[:, draw])[0]
+        error = own[draw] - views.gather(field) - plate
+        error -= np.tensordot(coefficients[:, draw], held.columns, axes=1)
+        error += np.tensordot(own_terms[:, draw], held.own, axes=1)
+        misaligned = grid.misaligned(parameters[:, draw])
+        for one, here, fitted in zip(error, known, held.rows, strict=True):
             if fitted >= 0:
-                error[:, row] -= misaligned[:, fitted]
-                continue
-            z, here = views.z[known[row]], error[:, row, known[row]]
-            phi, *tau = fitted_misalignment(z, here.T)[:, :, None]
-            error[:, row, known[row]] = here - 1j * phi * z - (tau[0] + 1j * tau[1])
-        each = np.ascontiguousarray((weight * abs(error) ** 2)[:, known])
-        squares[draws] = each.sum(axis=1) / (2 * known.sum())
+                one -= misaligned[fitted]
+            elif here.any():
+                phi, tau = fitted_misalignment(views.z[here], one[here])
+                one -= 1j * phi * views.z + tau
+        squares[draw] = (weight * abs(error) ** 2)[known].sum() / (2 * known.sum())
     mean = float(squares.mean())
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
-
-
-def _of_terms(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the effect of coefficients (p, k) on the readings, complex (k, views, nx, ny)."""
-    return np.array([np.tensordot(one, columns, axes=1) for one in coefficients.T])
 
 
 def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
@@ -278,19 +264,15 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     problem = model.problem
     grid, n = problem.system.grid, 3 * problem.system.grid.n_views
     found = model.found
-    inverse = found.inverse if len(found.inverse) else problem.system.grid_inverse
-    reduced = reduce_columns(grid, shapes_in_full(noise))
-    parameters = inverse[:n, :n] @ reduced.right
-    fields = reduced.free - grid.response @ parameters
+    drawn = [grid.fitted(one, found.inverse[:n, :n]) for one in noise]
+    fields, parameters = (np.stack(part, axis=1) for part in zip(*drawn, strict=True))
     if model.equations is None:
         return fields, parameters, np.zeros((0, len(noise)))
     now = equations_of(problem, found, model.equations.columns)
-    columns = now.columns.grid.reshape(now.n, -1)
-    right = np.zeros((now.n, len(noise)))
-    for draw, one in enumerate(noise):
-        field = fields[:, draw].reshape(grid.views.shape)
-        residual = grid.plate(one, field, parameters[:, draw])[1]
-        right[:, draw] = (np.conj(columns) @ (grid.weight * residual).ravel()).real
+    shapes = now.columns.shapes
+    right = np.stack([
+        shapes.against(shapes.sums(grid.weight * grid.plate(one, *fitted)[1]))
+        for one, fitted in zip(noise, drawn, strict=True)], axis=1)
     values, vectors = np.linalg.eigh(now.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))
@@ -304,13 +286,14 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
             parameters - now.projected.parameters[:n] @ coefficients, coefficients)
 
 
-def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return phi, Re and Im tau, (3, k), that fit errors, complex (P, k), at marks (P,) best."""
+def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> tuple[float, complex]:
+    """Return phi and tau that fit errors, complex (P,), at marks (P,) best."""
     columns = np.stack([1j * marks, np.ones_like(marks), np.full_like(marks, 1j)], axis=1)
     rows = np.concatenate([columns.real, columns.imag])
     scale = np.linalg.norm(rows, axis=0)
     values = np.concatenate([errors.real, errors.imag])
-    return np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale[:, None]
+    phi, x, y = np.linalg.lstsq(rows / scale, values, rcond=None)[0] / scale
+    return float(phi), complex(x, y)
 
 
 TENTHS = 10

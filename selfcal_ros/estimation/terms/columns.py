@@ -147,15 +147,6 @@ def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int
                   np.array(of_column, dtype=int), np.array(unit, dtype=complex))
 
 
-def shapes_in_full(columns: np.ndarray) -> Shapes:
-    """Return columns given in all views, complex (p, views, nx, ny)."""
-    p, views = columns.shape[:2]
-    every = np.arange(p)
-    return Shapes(p, columns.shape[2:], (every,) * views,
-                  tuple(columns[:, view].reshape(p, -1) for view in range(views)),
-                  every, np.ones(p, dtype=complex))
-
-
 @dataclass(frozen=True, eq=False)
 class WithinMarks:
     """Information on the coefficients from the visits of each mark: see `visits`.

@@ -267,7 +267,7 @@ class _Further:
         """Return it for refined and coarse equations of the same readings y."""
         at, grid = known_places(coarse), fine.grid
         spline, nodes = grid.views.spline, coarse.grid.views.spline
-        matrix, couple = grid.matrix, grid.real_columns
+        matrix, couple = grid.matrix, grid.coupling
         b, d = grid.right_side(y)
         within = np.linalg.pinv(grid.block, hermitian=True, rcond=GAP)
         both = np.concatenate([couple.real, couple.imag])
