@@ -60,13 +60,11 @@ class NormalEquations:
         The two sets of equations.
     grid_index, angular_index : tuple of int
         Position of their views in the measurement.
-    rank_only : bool
-        Whether only the rank is needed: a large field then needs no factorisation.
     """
 
     def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
-                 angular_index: tuple[int, ...], *, rank_only: bool = False) -> None:
-        self.grid, self.angular, self.rank_only = grid, angular, rank_only
+                 angular_index: tuple[int, ...]) -> None:
+        self.grid, self.angular = grid, angular
         self.grid_index, self.angular_index = grid_index, angular_index
         extra = [i for i in angular_index if i not in grid_index]
         self.size = 3 * len(grid_index) + len(extra)
@@ -75,20 +73,6 @@ class NormalEquations:
         of_view |= {i: 3 * len(grid_index) + row for row, i in enumerate(extra)}
         self.phi_at = np.array([of_view[i] for i in angular_index], dtype=int)
         """Index of phi of each angular view among the misalignments."""
-
-    @cached_property
-    def _core(self) -> GridSystem:
-        """Grid equations for the rank of the misalignments: the middle part of a large field.
-
-        If the middle of the plate determines all misalignments up to the datum, so does the
-        whole, since more readings can only add; if not, the whole has to be factorised.
-        """
-        if self.grid.n_sites <= FULL_SIZE**2 or not self.rank_only:
-            return self.grid
-        core = core_of(self.grid)
-        values = np.linalg.eigvalsh(core.schur)
-        free = len(values) - core.differences.shape[1]
-        return core if _rank(values, _trace(core)) == free - 7 else self.grid
 
     @cached_property
     def rigid(self) -> np.ndarray:
@@ -100,12 +84,9 @@ class NormalEquations:
 
     def normal(self, ratio: float) -> np.ndarray:
         """Return the normal matrix of all misalignments; `ratio` weighs lines (method eq. 4.6)."""
-        return self._joined(self.grid.schur, ratio)
-
-    def _joined(self, of_grid: np.ndarray, ratio: float) -> np.ndarray:
         out = np.zeros((self.size, self.size))
         n = 3 * self.grid.n_views
-        out[:n, :n] = of_grid
+        out[:n, :n] = self.grid.schur
         out[np.ix_(self.phi_at, self.phi_at)] += ratio * self.angular.schur
         return self.grid.tied(out)
 
@@ -115,7 +96,9 @@ class NormalEquations:
 
         Ranks are relative to it: the matrix after elimination may be mere rounding.
         """
-        return _trace(self.grid)
+        grid = self.grid
+        total = (grid.weight * (abs(grid.views.z) ** 2 + 2)).sum()
+        return float(max(total, np.finfo(float).tiny))
 
     @cached_property
     def angular_scale(self) -> float:
@@ -123,25 +106,20 @@ class NormalEquations:
         return float(max(self.angular.weight.sum(), np.finfo(float).tiny))
 
     @cached_property
-    def _core_scale(self) -> float:
-        return self.grid_scale if self._core is self.grid else _trace(self._core)
-
-    @cached_property
-    def _core_spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        values, vectors = np.linalg.eigh(self._core.schur)
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues and vectors of the grid's misalignment matrix."""
+        values, vectors = np.linalg.eigh(self.grid.schur)
         return values, vectors
 
     @cached_property
     def rank_schur(self) -> int:
         """Rank of the grid's misalignment matrix."""
-        return _rank(self._core_spectrum[0], self._core_scale)
+        return _rank(self._spectrum[0], self.grid_scale)
 
     @cached_property
     def grid_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
-        values, vectors = (self._core_spectrum if self._core is self.grid
-                           else np.linalg.eigh(self.grid.schur))
-        return pseudo_inverse(values, vectors, self.grid_scale)
+        return pseudo_inverse(*self._spectrum, self.grid_scale)
 
     def alone(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return map and misalignments of grid readings `y` fitted alone, in no datum."""
@@ -200,11 +178,10 @@ class NormalEquations:
     @cached_property
     def _null(self) -> np.ndarray:
         """Orthonormal undetermined misalignments, (size, nullity)."""
-        values, vectors = self._core_spectrum
+        values, vectors = self._spectrum
         if self.angular.n_views:
-            ratio = self._core_scale / self.angular_scale
-            values, vectors = np.linalg.eigh(self._joined(self._core.schur, ratio))
-        return vectors[:, values <= GAP * self._core_scale]
+            values, vectors = np.linalg.eigh(self.normal(self.grid_scale / self.angular_scale))
+        return vectors[:, values <= GAP * self.grid_scale]
 
     @cached_property
     def nullity(self) -> int:
@@ -325,20 +302,6 @@ class NormalEquations:
     def plate_gauge(self) -> Gauge:
         """Datum of the plate."""
         return Gauge(self.grid.views.z, self.known_marks, scale=False)
-
-
-def core_of(grid: GridSystem) -> GridSystem:
-    """Return the smaller system of the marks and sites in the middle of a field."""
-    low = [(size - FULL_SIZE) // 2 if size > FULL_SIZE else 0 for size in grid.views.shape]
-    part = tuple(slice(a, size - a) for a, size in zip(low, grid.views.shape, strict=True))
-    weight = grid.weight[(slice(None), *part)]
-    inside = GridSystem(grid.views.poses, weight, grid.views.unit).views.in_field
-    return GridSystem(grid.views.poses, weight * inside, grid.views.unit, grid.rotations)
-
-
-def _trace(grid: GridSystem) -> float:
-    total = (grid.weight * (abs(grid.views.z) ** 2 + 2)).sum()
-    return float(max(total, np.finfo(float).tiny))
 
 
 def _rank(values: np.ndarray, scale: float) -> int:
@@ -546,10 +509,6 @@ class PlacedEquations(NormalEquations):
 
     grid: PlacedSystem
 
-    @property
-    def _core(self) -> GridSystem:
-        return self.grid
-
     @cached_property
     def hides_fields(self) -> bool:
         """Whether a misalignment that no reading determines changes the map beyond its datum.
@@ -681,8 +640,7 @@ def system_of(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     return _equations(grid, angular)
 
 
-def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
-               rank_only: bool = False) -> NormalEquations:
+def _equations(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     lines = lines_of(angular)
     if grid.plate is not None:
         return PlacedEquations(
@@ -692,7 +650,7 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float], *,
     poses = cast(tuple[LatticePose, ...], grid.poses)
     return NormalEquations(
         GridSystem(poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate),
-        lines, grid.index, angular.index, rank_only=rank_only)
+        lines, grid.index, angular.index)
 
 
 def lines_of(angular: Marks[float]) -> AngularSystem:
@@ -703,8 +661,7 @@ def lines_of(angular: Marks[float]) -> AngularSystem:
     return AngularSystem(angular.poses, angular.weight, known_plate=angular.known_plate)
 
 
-def planned_system(artifact: Artifact, views: Sequence[View], *,
-                   rank_only: bool = False) -> NormalEquations:
+def planned_system(artifact: Artifact, views: Sequence[View]) -> NormalEquations:
     """Return the system of the planned views: every mark in the field, unit repeats.
 
     Parameters
@@ -713,8 +670,6 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
         The plate.
     views : sequence of View
         The plan; the cells of images are views of their own.
-    rank_only : bool
-        Whether only the rank is needed.
     """
     views = with_sub_views(views)
     grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
@@ -729,7 +684,7 @@ def planned_system(artifact: Artifact, views: Sequence[View], *,
         Marks(poses, weight, tuple(i for i, _ in grid_views),
               rotations=rotations_of([view for _, view in grid_views]), plate=artifact.placed),
         Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
-              tuple(i for i, _ in angular), artifact.harmonics), rank_only=rank_only)
+              tuple(i for i, _ in angular), artifact.harmonics))
 
 
 class Memo[Key, Value]:

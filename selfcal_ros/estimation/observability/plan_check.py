@@ -18,14 +18,15 @@ from selfcal_ros.estimation.observability.rank import (
     add_views,
     full_observability,
     identifies,
+    smaller,
     unseen_modes,
     with_unchecked,
 )
-from selfcal_ros.model.artifact import Artifact, default_map_grid
+from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum, rms
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.view import ORDERS, Plan, View, parse_order, with_sub_views
+from selfcal_ros.model.view import ORDERS, Plan, View, parse_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +99,6 @@ def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
 
 SEARCH_SIZE = 11
 """Largest field on which views are searched for: what is found is then evaluated in full."""
-
-NARROW = 5
-"""Smallest number of sites across a reduced field."""
 
 PROXY_SIZE = 101
 """Field on which the uncertainty of a larger field is predicted."""
@@ -243,28 +241,6 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
     return identifies(plan.artifact, [replace(view, angular=False)
                                       for view in (*plan.views, *views) if view.grid])
-
-
-def smaller(plan: Plan, size: int) -> Plan:
-    """Return the plan on a field of at most `size` sites per side, with the same turns and shifts.
-
-    The field keeps its proportions, on which the uncertainty of a long field depends, and sides of
-    even or odd numbers, and is large enough for the plan's own shifts. A list of marks remains as
-    it is.
-    """
-    if plan.artifact.marks or max(plan.artifact.shape) <= size:
-        return plan
-    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
-             for view in with_sub_views(plan.views)]
-    room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
-    part = min(1.0, max(size, room) / max(plan.artifact.shape))
-    nx, ny = (max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
-              for n in plan.artifact.shape)
-    plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
-                     0 if nx == ny else ny, harmonics=plan.artifact.harmonics)
-    grid = plan.artifact.map_grid
-    return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
-        default_map_grid(plate), interpolation=grid.interpolation)))
 
 
 @dataclass(frozen=True)

@@ -22,16 +22,17 @@ import numpy as np
 from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.angular import GAP, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import (
+    FULL_SIZE,
     Memo,
     NormalEquations,
     planned_system,
     pseudo_inverse,
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.verdict import Finding
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.view import Plan, View, with_sub_views
 
 DATUM_ROWS = 7
 """Stage translation, rotation, magnification; plate translation, rotation (Hu 5, 11)."""
@@ -39,28 +40,56 @@ DATUM_ROWS = 7
 DETERMINED = 0.5
 """Part of the sites of a field, or of the images of a cell, without which there are too few."""
 
+NARROW = 5
+"""Smallest number of sites across a reduced field."""
 
 _measured: Memo[tuple[Artifact, tuple[View, ...]], Observability] = Memo()
 
 
 def plan_observability(plan: Plan) -> Observability:
     """Return the observability of the plan if every mark in the field is read."""
-    system = planned_system(plan.artifact, plan.views, rank_only=True)
+    system = planned_system(plan.artifact, plan.views)
     return full_observability(system, plan.artifact, plan.views)
 
 
 def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
     """Return whether views determine the whole map if every mark in the field is read.
 
-    For searches: no advice, and no matrix if the count of components already says no.
+    For searches: no advice, no matrix if the count of components already says no, and that of the
+    middle of a large field if it determines all misalignments.
     """
-    system = planned_system(artifact, views, rank_only=True)
+    system = planned_system(artifact, views)
     if artifact.map_grid is not None:
         return _nodes_known(system)
     parts = system.grid.components
     if parts.balanced.any() or min(parts.of_site.min(), parts.of_mark.min()) < 0:
         return False
+    middle = smaller(Plan("", artifact, tuple(views)), FULL_SIZE)
+    if middle.artifact != artifact and not deficiency(planned_system(middle.artifact, views)):
+        return True  # further readings can only add
     return deficiency(system) == 0
+
+
+def smaller(plan: Plan, size: int) -> Plan:
+    """Return the plan on a field of at most `size` sites per side, with the same turns and shifts.
+
+    The field keeps its proportions, on which the uncertainty of a long field depends, and sides of
+    even or odd numbers, and is large enough for the plan's own shifts. A list of marks remains as
+    it is.
+    """
+    if plan.artifact.marks or max(plan.artifact.shape) <= size:
+        return plan
+    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
+             for view in with_sub_views(plan.views)]
+    room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
+    part = min(1.0, max(size, room) / max(plan.artifact.shape))
+    nx, ny = (max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
+              for n in plan.artifact.shape)
+    plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
+                     0 if nx == ny else ny, harmonics=plan.artifact.harmonics)
+    grid = plan.artifact.map_grid
+    return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
+        default_map_grid(plate), interpolation=grid.interpolation)))
 
 
 def deficiency(system: NormalEquations) -> int:

@@ -33,9 +33,9 @@ from selfcal_ros.estimation.observability.plan_check import (
     more_views,
     other_orders,
     predicted_on,
-    smaller,
     unit_repeats,
 )
+from selfcal_ros.estimation.observability.rank import smaller
 from selfcal_ros.estimation.options import OWED
 from selfcal_ros.estimation.terms.equations import (
     FREE,

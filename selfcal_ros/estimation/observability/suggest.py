@@ -26,11 +26,15 @@ from selfcal_ros.estimation.observability.plan_check import (
     more_views,
     other_orders,
     predict,
-    smaller,
     unit_repeats,
     unused_name,
 )
-from selfcal_ros.estimation.observability.rank import deficiency, equivalent_key, full_observability
+from selfcal_ros.estimation.observability.rank import (
+    deficiency,
+    equivalent_key,
+    full_observability,
+    smaller,
+)
 from selfcal_ros.estimation.observability.resistance import with_part_of_terms
 from selfcal_ros.estimation.terms.planned import Assumed, planned_equations
 from selfcal_ros.model.artifact import Artifact

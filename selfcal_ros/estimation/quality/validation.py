@@ -36,12 +36,8 @@ from selfcal_ros.estimation.lattice.readings import (
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, Marks, lines_of
-from selfcal_ros.estimation.observability.plan_check import (
-    SEARCH_SIZE,
-    candidate_views,
-    smaller,
-)
-from selfcal_ros.estimation.observability.rank import identifies
+from selfcal_ros.estimation.observability.plan_check import SEARCH_SIZE, candidate_views
+from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
 from selfcal_ros.estimation.terms.places import places_of

@@ -18,12 +18,12 @@ from selfcal_ros.estimation.observability.plan_check import (
     check_plan,
     find_cures,
     predict_plan,
-    smaller,
 )
 from selfcal_ros.estimation.observability.rank import (
     identifies,
     is_unseen,
     plan_observability,
+    smaller,
     unseen_modes,
 )
 from selfcal_ros.model.view import View
