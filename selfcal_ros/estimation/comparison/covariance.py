@@ -28,9 +28,9 @@ from selfcal_ros.estimation.joint.images import ImageNoise, stops_of
 from selfcal_ros.estimation.joint.problem import bounded_ratio
 from selfcal_ros.estimation.joint.solve import factors_of
 from selfcal_ros.estimation.lattice.connectivity import Gauge
-from selfcal_ros.estimation.lattice.readings import in_field, pose_of
+from selfcal_ros.estimation.lattice.readings import Marks, in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
-from selfcal_ros.estimation.normal.equations import Marks, NormalEquations, system_of
+from selfcal_ros.estimation.normal.equations import NormalEquations, system_of
 from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, first_order
 from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept

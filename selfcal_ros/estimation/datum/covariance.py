@@ -46,10 +46,9 @@ NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
              plate: np.ndarray, half_width_m: float) -> float:
     """Return c for a map and a plate in their datum, m at the unit of position."""
-    value = reference.relative_error * half_width_m
-    if not reference.kind.of_plate:
-        return value - float(np.real(_slope(system, reference.kind).conj() @ field.ravel()))
-    return float(np.real(np.vdot(scale_of_plate(system, reference), plate))) - value
+    sites, marks = scale_rows(system, reference)
+    value = reference.relative_error * half_width_m * (-1 if reference.kind.of_plate else 1)
+    return value + float(np.real(np.vdot(sites, field) + np.vdot(marks, plate)))
 
 
 def scale_rows(system: NormalEquations, reference: ReferenceLength

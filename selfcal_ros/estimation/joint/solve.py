@@ -46,7 +46,7 @@ from selfcal_ros.estimation.normal.equations import (
     MAX_NODES,
     UNASKED_SITES,
     NormalEquations,
-    system_for,
+    system_of,
 )
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
@@ -348,7 +348,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     if not grid.index:
         raise NoDataError(f"plan '{measurements.plan_id}'", "no grid mark was read",
                           "record detections of the plate's marks in at least three views")
-    system = system_for(grid, angular)
+    system = system_of(grid, angular)
     seen = measured_observability(system, measurements.artifact,
                                   tuple(v.view for v in measurements.views))
     if not seen.identifiable:

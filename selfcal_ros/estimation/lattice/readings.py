@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readings on the lattice, in a canonical form that does not depend on their order; view poses."""
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import cast
 
 import numpy as np
@@ -33,49 +33,68 @@ def in_field(view: View, artifact: Artifact) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class GridData:
-    """Grid readings on the plate's lattice.
+class Marks[Pose]:
+    """Marks of one kind that were read, and how often.
 
     Attributes
     ----------
-    index : tuple of int
-        Position in `Measurements.views` of every grid view.
-    poses : tuple of LatticePose or PlacedPose
-        Their poses.
-    plate : Artifact, optional
-        The plate, if the map has nodes of its own.
-    y : complex array (views, nx, ny)
-        Deviations turned into the plate frame, m; 0 where not read.
-    weight : float array (views, nx, ny)
+    poses : tuple
+        Of their views: on the lattice or anywhere for the grid, turns in lines for lines; with
+        harmonics those of the axis where it stood.
+    weight : float array (views, *marks)
         Repeats, or (sigma / u)^2 where detections declare their uncertainty; 0 = not read.
-    sigma_declared : float
-        Standard deviation of one reading as declared, m; NaN if not declared.
+    index : tuple of int
+        Position of the views in the measurement.
+    harmonics : int
+        Of the map, if it is a Fourier series.
     rotations : tuple of int
         The first of the views that have the rotation of each view, see `rotations_of`.
+    known_plate : bool
+        Whether the plate is known.
+    plate : Artifact, optional
+        The plate, if the map has nodes of its own.
     """
 
-    index: tuple[int, ...]
-    poses: tuple[AnyPose, ...]
-    plate: Artifact | None
-    y: np.ndarray
+    poses: tuple[Pose, ...]
     weight: np.ndarray
-    sigma_declared: float
-    rotations: tuple[int, ...]
+    index: tuple[int, ...]
+    harmonics: int = 0
+    rotations: tuple[int, ...] = ()
+    known_plate: bool = False
+    plate: Artifact | None = None
+
+    @cached_property
+    def _key(self) -> tuple:
+        return (self.plate, self.poses, self.index, self.harmonics, self.rotations,
+                self.known_plate, self.weight.shape, self.weight.tobytes())
+
+    def __hash__(self) -> int:
+        """Return that of all that the equations depend on."""
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether other marks have the same equations."""
+        return getattr(other, "_key", None) == self._key
 
 
 @dataclass(frozen=True, eq=False)
-class AngularData:
-    """Angular readings: like `GridData` on the circle, arrays (views, K), rad.
+class Deviations[Pose](Marks[Pose]):
+    """Marks of one kind with their readings.
 
-    With harmonics the turns are those of the axis where it stood.
+    Attributes
+    ----------
+    y : complex array (views, nx, ny), or float array (views, K)
+        Deviations turned into the plate frame, m; or those of lines, rad. 0 where not read.
+    sigma_declared : float
+        Standard deviation of one reading as declared, m or rad; NaN if not declared.
     """
 
-    index: tuple[int, ...]
-    turns: tuple[float, ...]
-    y: np.ndarray
-    weight: np.ndarray
-    sigma_declared: float
-    harmonics: int = 0
+    y: np.ndarray = field(kw_only=True)
+    sigma_declared: float = field(kw_only=True)
+
+
+GridData = Deviations[AnyPose]
+AngularData = Deviations[float]
 
 
 def grid_data(measurements: Measurements) -> GridData:
@@ -107,8 +126,8 @@ def grid_data(measurements: Measurements) -> GridData:
         ones.append((flat, readings.count, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
-    return GridData(index, tuple(poses), artifact.placed, y, weight, sigma,
-                    rotations_of([measurements.views[i].view for i in index]))
+    return GridData(tuple(poses), weight, index, plate=artifact.placed, y=y, sigma_declared=sigma,
+                    rotations=rotations_of([measurements.views[i].view for i in index]))
 
 
 def angular_data(measurements: Measurements) -> AngularData:
@@ -132,7 +151,7 @@ def angular_data(measurements: Measurements) -> AngularData:
         about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
         turns.append(turn + about if artifact.harmonics and about else turn)
     sigma = _declare(weight, ones)
-    return AngularData(index, tuple(turns), y, weight, sigma, artifact.harmonics)
+    return AngularData(tuple(turns), weight, index, artifact.harmonics, y=y, sigma_declared=sigma)
 
 
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:

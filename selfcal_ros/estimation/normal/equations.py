@@ -10,7 +10,6 @@ Equations are made once for each plan, planned or measured, and kept.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import cast
 from weakref import WeakKeyDictionary
@@ -22,12 +21,7 @@ from scipy.sparse import csr_matrix
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews
-from selfcal_ros.estimation.lattice.readings import (
-    AngularData,
-    GridData,
-    in_field,
-    pose_of,
-)
+from selfcal_ros.estimation.lattice.readings import Marks, in_field, pose_of
 from selfcal_ros.estimation.normal.angular import (
     GAP,
     KNOWN,
@@ -583,55 +577,6 @@ class PlacedEquations(NormalEquations):
     def known_marks(self) -> np.ndarray:
         """Marks read where the map is known, bool (nx, ny)."""
         return (self.grid.read & self.grid.views.near(self.known_sites)).any(axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Marks[Pose]:
-    """Marks of one kind that were read, and how often.
-
-    Attributes
-    ----------
-    poses : tuple
-        Of their views: lattice poses for the grid, turns in lines.
-    weight : float array (views, ...)
-        Weights of the marks on the plate.
-    index : tuple of int
-        Position of the views in the measurement.
-    harmonics : int
-        Of the map, if it is a Fourier series.
-    rotations, known_plate
-        As of `GridSystem`.
-    plate : Artifact, optional
-        The plate, if the map has nodes of its own.
-    """
-
-    poses: tuple[Pose, ...]
-    weight: np.ndarray
-    index: tuple[int, ...]
-    harmonics: int = 0
-    rotations: tuple[int, ...] = ()
-    known_plate: bool = False
-    plate: Artifact | None = None
-
-    @cached_property
-    def _key(self) -> tuple:
-        return (self.plate, self.poses, self.index, self.harmonics, self.rotations,
-                self.known_plate, self.weight.shape, self.weight.tobytes())
-
-    def __hash__(self) -> int:
-        """Return that of all that the equations depend on."""
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        """Return whether other marks have the same equations."""
-        return getattr(other, "_key", None) == self._key
-
-
-def system_for(grid: GridData, angular: AngularData) -> NormalEquations:
-    """Return the system of a measured plan, from the cache if the same marks were read."""
-    return system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations,
-                           plate=grid.plate),
-                     Marks(angular.turns, angular.weight, angular.index, angular.harmonics))
 
 
 @lru_cache(maxsize=4)

@@ -35,7 +35,7 @@ from selfcal_ros.estimation.lattice.readings import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, Marks, lines_of
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, lines_of
 from selfcal_ros.estimation.observability.plan_check import SEARCH_SIZE, candidate_views
 from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
@@ -180,7 +180,7 @@ def line_errors(solved: Solved, held: AngularData) -> np.ndarray:
     system, found, fitted = model.problem.system, model.found, model.problem.angular.index
     field = np.where(system.known_lines, found.g_theta, np.nan)
     plate = np.where((held.weight > 0) & system.known_plate_lines, found.a_theta, np.nan)
-    lines = lines_of(Marks(held.turns, held.weight, held.index, held.harmonics))
+    lines = lines_of(held)
     error = held.y - lines.gather(field) - plate
     terms = NO_LINES if model.equations is None else model.equations.columns.lines
     for one, index in zip(error, held.index, strict=True):

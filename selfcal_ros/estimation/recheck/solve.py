@@ -26,10 +26,10 @@ from selfcal_ros.estimation.joint.problem import (
     problem_of,
 )
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
-from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
+from selfcal_ros.estimation.lattice.readings import Marks, angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR
-from selfcal_ros.estimation.normal.equations import TRACE, Marks, lines_of, system_of
+from selfcal_ros.estimation.normal.equations import TRACE, lines_of, system_of
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
@@ -222,8 +222,7 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
     if not grid.weight.any():
         raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
                           "record detections of the marks of the plate")
-    system = system_of(Marks(grid.poses, grid.weight, grid.index, rotations=grid.rotations,
-                             known_plate=True, plate=grid.plate), Marks((), angular.weight[:0], ()))
+    system = system_of(replace(grid, known_plate=True), Marks((), angular.weight[:0], ()))
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
@@ -336,8 +335,8 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
     angular, of_terms = readings.problem.angular, readings.columns.lines
     (_, known), before = plate.together.lines()
     count = len(known)
-    lines = lines_of(Marks(angular.turns, np.where(known, angular.weight, 0.0), (),
-                           angular.harmonics, known_plate=True))
+    lines = lines_of(replace(angular, weight=np.where(known, angular.weight, 0.0),
+                             known_plate=True))
     if lines.n_readings:
         _require_noise(theta.sigma)
     of_plate = np.broadcast_to(np.eye(count)[:, None], (count, *angular.weight.shape))

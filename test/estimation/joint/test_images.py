@@ -16,7 +16,7 @@ from selfcal_ros.estimation.joint.camera import Distortion, straight_products
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
-from selfcal_ros.estimation.normal.equations import system_for
+from selfcal_ros.estimation.normal.equations import system_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.visits import ground_of
 from selfcal_ros.model.readings import Sense
@@ -148,7 +148,7 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
 @pytest.mark.parametrize("missing", [0.0, 0.06])
 def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
     measurements, matrix, stops, inverse = whole(missing)
-    system = system_for(grid_data(measurements), angular_data(measurements))
+    system = system_of(grid_data(measurements), angular_data(measurements))
     grid = grid_data(measurements)
     images = image_noise(measurements.artifact, [v.view for v in measurements.views], system,
                          ground=ground_of(measurements, grid, 1.0))
