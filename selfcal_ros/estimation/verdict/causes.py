@@ -279,11 +279,11 @@ class Explained:
 
     Attributes
     ----------
-    rows, at : bool array (p,), int array (k,)
-        The columns: as a mask, k of p, and as indices.
-    own_inverse, rank : float array (k, k), int
+    at : int array (k,)
+        The columns.
+    inverse, rank : float array (k, k), int
         Pseudo-inverse of their information, and its rank.
-    own_values : float array (k,)
+    values : float array (k,)
         Their estimated coefficients.
     explained : float
         Sum of squares that they explain, m^2.
@@ -291,28 +291,13 @@ class Explained:
         Remaining squares of the means of the marks, m^2, and their degrees of freedom.
     """
 
-    rows: np.ndarray
     at: np.ndarray
-    own_inverse: np.ndarray
+    inverse: np.ndarray
     rank: int
-    own_values: np.ndarray
+    values: np.ndarray
     explained: float
     between: float
     dof_between: float
-
-    @property
-    def inverse(self) -> np.ndarray:
-        """The pseudo-inverse for all columns, (p, p), 0 for the others."""
-        out = np.zeros((len(self.rows),) * 2)
-        out[self.at[:, None], self.at] = self.own_inverse
-        return out
-
-    @property
-    def values(self) -> np.ndarray:
-        """The coefficients of all columns, (p,), 0 for the others."""
-        out = np.zeros(len(self.rows))
-        out[self.at] = self.own_values
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,42 +327,17 @@ class Candidates:
 
     def explain(self, rows: np.ndarray) -> Explained:
         """Fit the columns of `rows`, bool (p,), together."""
-        return self.explain_each([rows])[0]
-
-    def explain_each(self, many: Sequence[np.ndarray]) -> list[Explained]:
-        """Fit each of many sets of columns, bool (p,), by itself.
-
-        Sets of equal size are computed together: for few columns a call costs more than its work.
-        """
-        places = [rows.nonzero()[0] for rows in many]
-        found: dict[int, Explained] = {}
-        for size in {len(at) for at in places}:
-            mine = [number for number, at in enumerate(places) if len(at) == size]
-            limits = np.array([self.equations.limit(many[number] & (self.prior == 0))
-                               for number in mine])
-            blocks = self._of_one_size(np.array([places[number] for number in mine]), limits)
-            for number, block in zip(mine, blocks, strict=True):
-                found[number] = Explained(many[number], places[number], *block)
-        return [found[number] for number in range(len(many))]
-
-    def _of_one_size(self, at: np.ndarray, limits: np.ndarray) -> Iterator[tuple]:
-        """Yield the fields of `Explained` from `own_inverse` on, for the columns `at`, int (n, k).
-
-        Eigenvalues up to `limits`, (n,), count as 0.
-        """
-        sums, square = self.right.sums, (at[:, :, None], at[:, None, :])
-        values, vectors = np.linalg.eigh(self._scaled[square])
-        told = values > limits[:, None]
-        vectors = vectors / self._norm[at][:, :, None]
-        inverse = (vectors * (told / np.where(told, values, 1.0))[:, None]) @ vectors.swapaxes(1, 2)
+        sums, at = self.right.sums, np.flatnonzero(rows)
+        square = np.ix_(at, at)
+        size, vectors = np.linalg.eigh(self._scaled[square])
+        told = size > self.equations.limit(rows & (self.prior == 0))
+        vectors = vectors[:, told] / self._norm[at, None]
+        inverse = (vectors / size[told]) @ vectors.T
         right, gram = self._total[at], self.equations.projected.gram[square]
-        own = (inverse @ right[:, :, None])[:, :, 0]
-        left = (gram @ own[:, :, None])[:, :, 0] - 2 * self.right.between[at]
-        between = sums.between + (own * left).sum(axis=1)
-        dof = sums.dof_between - (inverse * gram).sum(axis=(1, 2))
-        explained = (right * own).sum(axis=1)
-        return zip(inverse, told.sum(axis=1).tolist(), own, explained.tolist(), between.tolist(),
-                   dof.tolist(), strict=True)
+        values = inverse @ right
+        between = sums.between + values @ (gram @ values - 2 * self.right.between[at])
+        return Explained(at, inverse, int(told.sum()), values, float(right @ values),
+                         float(between), sums.dof_between - float((inverse * gram).sum()))
 
     @cached_property
     def _scaled(self) -> np.ndarray:
@@ -563,9 +523,8 @@ def select_explanations(pool: Candidates, groups: list[Group],
     rank = 0
     while groups and len(found) < MAX_CAUSES:
         before = pool.explain(taken)
-        fitted = pool.explain_each([taken | group.rows for group in groups])
-        tests = [(_test(pool, before, after, group), group)
-                 for after, group in zip(fitted, groups, strict=True)]
+        tests = [(_test(pool, before, pool.explain(taken | group.rows), group), group)
+                 for group in groups]
         good = [(test, group) for test, group in tests
                 if test is not None and test[0] < CAUSE_LEVEL]
         if not good:
@@ -596,8 +555,8 @@ def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) ->
     """Return whether `best` explains nothing beyond what `group` explains."""
     if any(name not in blocks() or blocks()[name].between for name in (group.name, best.name)):
         return False
-    before, after = pool.explain_each([taken | group.rows, taken | group.rows | best.rows])
-    more = _test(pool, before, after, best)
+    known = taken | group.rows
+    more = _test(pool, pool.explain(known), pool.explain(known | best.rows), best)
     return more is None or more[0] >= CAUSE_LEVEL
 
 
@@ -622,10 +581,12 @@ def _test(pool: Candidates, before: Explained, after: Explained,
 def _explanation(pool: Candidates, taken: np.ndarray, group: Group, p: float) -> Explanation:
     fitted = pool.explain(taken | group.rows)
     variance, _ = pool.noise(fitted)
-    own = np.where(group.rows, fitted.values, 0.0)
+    here = group.rows[fitted.at]
+    own = np.zeros(len(group.rows))
+    own[group.rows] = fitted.values[here]
     columns = tuple(compress(pool.equations.columns.columns, group.rows))
-    return Explanation(group.name, columns, own[group.rows],
-                       variance * fitted.inverse[np.ix_(group.rows, group.rows)], p,
+    return Explanation(group.name, columns, fitted.values[here],
+                       variance * fitted.inverse[np.ix_(here, here)], p,
                        pool.explain(group.rows).rank == int(group.rows.sum()), 0.0, group.part,
                        group.mark).with_effect(pool.equations, own)
 

@@ -34,6 +34,7 @@ from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
+from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
 from selfcal_ros.estimation.verdict.leverage import MAX_REMOVED
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
@@ -124,8 +125,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
         result, verdict=verdict,
-        findings=(*result.findings, *_visits_findings(checked), *_repeats_findings(measurements),
-                  *_left_out_findings(measurements),
+        findings=(*result.findings, *_visits_findings(checked), *_views_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
@@ -308,29 +308,25 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
 
 
-def _repeats_findings(measurements: Measurements) -> list[Finding]:
-    """Return a finding for each view in which repeats of marks often contradict each other."""
-    found: dict[str, tuple[int, int]] = {}
-    for view in measurements.views:
-        lost, name = view.rejected.get(REPEAT_OUTLIER, 0), without_cell(view.view.name)
-        before = found.get(name, (0, 0))
-        found[name] = before[0] + lost, before[1] + lost + view.used
-    return [Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
-            for name, (lost, total) in found.items()
-            if lost > max(FEW_OUTLIERS, MAX_REMOVED * total)]
+def _views_findings(measurements: Measurements) -> Iterator[Finding]:
+    """Yield the views in which repeats of marks often contradict each other, then those left out.
 
-
-def _left_out_findings(measurements: Measurements) -> list[Finding]:
-    """Return a finding for each view of whose detections none became a reading."""
-    used: dict[str, int] = {}
+    Of the detections of these none became a reading.
+    """
+    used: Counter[str] = Counter()
     rejected: dict[str, Counter[str]] = {}
     for view in measurements.views:
         name = without_cell(view.view.name)
-        used[name] = used.get(name, 0) + view.used
+        used[name] += view.used
         rejected.setdefault(name, Counter()).update(view.rejected)
-    return [Finding("view_left_out", view=name, details={
-        "rejected": {str(reason): count for reason, count in rejected[name].most_common(3)}})
-            for name, count in used.items() if not count and rejected[name]]
+    for name, counts in rejected.items():
+        lost, total = counts[REPEAT_OUTLIER], counts[REPEAT_OUTLIER] + used[name]
+        if lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
+            yield Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
+    for name, counts in rejected.items():
+        if counts and not used[name]:
+            yield Finding("view_left_out", view=name, details={
+                "rejected": {str(reason): count for reason, count in counts.most_common(3)}})
 
 
 FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
@@ -344,18 +340,16 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     left empty, so that the same readings give the same result. Stamps of 1970 are no dates: those
     of a simulated clock, or of images whose times are not known.
     """
-    stamps = [stamp for view in measurements.views
-              if view.visits is not None and len(view.visits.stamp_ns)
-              for stamp in (int(view.visits.stamp_ns.min()), int(view.visits.stamp_ns.max()))]
+    first, last = time_ranges(measurements.views, [0] * len(measurements.views)).get(0, (0, 0))
     extra: dict[str, Any] = {"visit_order": {
         view.view.name: view.view.visit_order for view in measurements.views
         if view.view.visit_order}}
     if options.terms_from:
         extra["model_terms_from"] = options.terms_from
     duration = float("nan")
-    if stamps and min(stamps) >= FIRST_DATE_NS:
-        extra |= {"first_exposure": _iso(min(stamps)), "last_exposure": _iso(max(stamps))}
-        duration = (max(stamps) - min(stamps)) / NS_PER_S
+    if first >= FIRST_DATE_NS:
+        extra |= {"first_exposure": _iso(first), "last_exposure": _iso(last)}
+        duration = (last - first) / NS_PER_S
     return Provenance("", duration, __version__, extra)
 
 
