@@ -52,7 +52,7 @@ class Components:
 
 
 def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: int,
-               n_marks: int, turning: int = -1) -> Components:
+               n_marks: int) -> Components:
     """Return the components of readings.
 
     Parameters
@@ -61,8 +61,6 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
         Site and mark that each reading joins, and its quarter turns (0 for angular lines).
     n_sites, n_marks : int
         Number of sites and marks.
-    turning : int
-        A site known to be in a component that is not balanced; -1 = unknown.
     """
     of_site, of_mark = np.full(n_sites, -1), np.full(n_marks, -1)
     if not len(site):
@@ -73,9 +71,8 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
     other = np.flatnonzero(first[mark] != np.arange(len(mark)))
     start = first[mark[other]]
     turn = (q[other] - q[start]) % 4
-    plain = turning >= 0 or not turn.any()
-    label = _connect(site[start], site[other], n_sites)[None] if plain else _cover(
-        site[start], site[other], turn, n_sites)
+    label = _cover(site[start], site[other], turn, n_sites) if turn.any() else _connect(
+        site[start], site[other], n_sites)[None]
     touched = np.zeros(n_sites, dtype=bool)
     touched[site] = True
     # the copies of a site are in all components of the cover over its own component
@@ -83,10 +80,6 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
                                return_inverse=True)
     copies = label[:, np.flatnonzero(touched)[one]]
     balanced = (copies[1:] != copies[0]).all(axis=0)
-    if turning >= 0 and len(balanced) == 1:
-        balanced = np.zeros(1, dtype=bool)
-    elif turning >= 0:
-        return components(site, mark, q, n_sites=n_sites, n_marks=n_marks)
     of_site[touched] = number
     of_mark[mark] = of_site[site]
     return Components(of_site, of_mark, balanced)

@@ -88,12 +88,7 @@ class PlateEliminated(ABC):
         if self.known_plate:
             return Components.of_one(np.isin(np.arange(self.n_sites), site),
                                      np.zeros(self.n_marks, dtype=bool))
-        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks,
-                          turning=self._find_turning_site())
-
-    def _find_turning_site(self) -> int:
-        """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
-        return -1
+        return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks)
 
     @property
     def rank(self) -> int:

@@ -6,7 +6,6 @@ Re tau, Im tau), which are eliminated last.
 """
 
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 from scipy.linalg import helmert
@@ -55,17 +54,6 @@ class GridSystem(PlateEliminated):
     def free_turns(self) -> tuple[np.ndarray, np.ndarray]:
         """Quarter turns of the free vectors of components at sites and marks, int (sites,) each."""
         return free_turns(*self.edges, self.components)
-
-    def _find_turning_site(self) -> int:
-        """Return a site visited by one mark in two turns, which closes a path; -1 = none."""
-        q = [pose.q for pose in self.views.poses]
-        for i, j in combinations(range(self.n_views), 2):
-            if q[i] != q[j]:
-                same = self.read[i] & self.read[j]
-                same &= self.views.site_index[i] == self.views.site_index[j]
-                if same.any():
-                    return int(self.views.site_index[i].ravel()[same.argmax()])
-        return -1
 
     @cached_property
     def factor(self) -> Factor:
