@@ -46,8 +46,6 @@ class LatticeViews:
         Marks (and sites) along x and y.
     poses : tuple of LatticePose
         One per view.
-    unit : float
-        Pitches in the unit of positions; 0 = the longer half width.
     """
 
     bilinear = False
@@ -55,11 +53,10 @@ class LatticeViews:
     node_pitch = 1.0
     """Distance of neighbouring nodes, in pitches of the plate."""
 
-    def __init__(self, shape: tuple[int, int], poses: tuple[LatticePose, ...],
-                 unit: float = 0) -> None:
+    def __init__(self, shape: tuple[int, int], poses: tuple[LatticePose, ...]) -> None:
         self.shape, self.plate_shape, self.poses = shape, shape, poses
         self.half = (shape[0] - 1) / 2, (shape[1] - 1) / 2
-        self.unit = unit or max(self.half)
+        self.unit = max(self.half)
 
     @property
     def reach(self) -> int:

@@ -26,8 +26,6 @@ class GridSystem(PlateEliminated):
         One per view.
     weight : float array (views, nx, ny)
         Weight of each reading; 0 = not read.
-    unit : float
-        Pitches in the unit of positions; 0 = the longer half width.
     rotations : tuple of int
         The first of the views that have the rotation of each view, see `rotations_of`. Empty: each
         view has its own.
@@ -37,11 +35,11 @@ class GridSystem(PlateEliminated):
 
     coordinates, of_view = 2, 3
 
-    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray, unit: float = 0,
+    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray,
                  rotations: tuple[int, ...] = (), *, known_plate: bool = False) -> None:
         super().__init__(weight, known_plate=known_plate)
         self.rotations = rotations
-        self.views = LatticeViews(weight.shape[1:], poses, unit)
+        self.views = LatticeViews(weight.shape[1:], poses)
 
     @cached_property
     def edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -42,19 +42,16 @@ class ReducedColumns:
 
     Attributes
     ----------
-    grid : GridSystem
-        The measured plan.
     shapes : Shapes
         The columns, p of them, of q shapes.
     sites : complex array (sites, q)
-        Right-hand side s of every shape.
+        M^-1 s of every shape, with s its right-hand side.
     inner : complex array (q, q)
         Weighted inner products of the shapes' residuals after marks and sites.
     asked : complex array (2 views, q)
         Coupling of the shapes to rotation and offset of every view, sites eliminated.
     """
 
-    grid: GridSystem
     shapes: Shapes
     sites: np.ndarray
     inner: np.ndarray
@@ -63,7 +60,7 @@ class ReducedColumns:
     @cached_property
     def free(self) -> np.ndarray:
         """M^-1 s of every column, complex (sites, p)."""
-        return self.shapes.of_columns(self.grid.factor.solve(self.sites))
+        return self.shapes.of_columns(self.sites)
 
     @cached_property
     def right(self) -> np.ndarray:
@@ -80,8 +77,9 @@ class ReducedColumns:
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     """Return columns with the sites eliminated; the last ones are kept."""
     sites, inner, asked = _marks_eliminated(grid, shapes)
-    inner -= grid.factor.products(sites)
-    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
+    solved = grid.solve(sites)
+    inner -= sites.conj().T @ solved
+    return ReducedColumns(shapes, solved, (inner + inner.conj().T) / 2,
                           asked - _coupled(grid, sites))
 
 

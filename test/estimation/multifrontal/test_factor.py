@@ -77,5 +77,3 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
     np.testing.assert_allclose(grid.factor.solve(right), inverse @ right, atol=1e-9 * size)
     np.testing.assert_allclose(grid.factor.solve(right[:, 0]), (inverse @ right)[:, 0],
                                atol=1e-9 * size)
-    np.testing.assert_allclose(grid.factor.products(right), right.conj().T @ inverse @ right,
-                               atol=1e-9 * size)
