@@ -10,6 +10,7 @@ give the probability of the most telling of the three; every other one tells how
 found.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -198,6 +199,31 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     InputError
         If less than three nodes are known in both maps.
     """
+    common, values, tests = _compared(new, artifact, plate)
+    covariance, dof = tests.covariance, tests.dof
+    modes = datum_modes(artifact, scale=True).reshape(4, -1).T[common]
+    in_datum = tests.without(values)
+    test = significance(in_datum, tests)
+    row = scale_row(modes)
+    scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
+
+    out = np.full((2, len(common)), np.nan)
+    out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
+    changes, u = out.reshape(2, 2, *artifact.shape)
+    return Change(changes, u, test, 1.0 if test is None else tests.p(in_datum), scale, u_scale,
+                  2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
+                  None if test is None else tests)
+
+
+def _compared(new: NewMap, artifact: Artifact,
+              plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, ChangeTests]:
+    """Return where both XY maps are known, new minus old there, and the tests of that.
+
+    Raises
+    ------
+    InputError
+        As `map_change`.
+    """
     old, sites = plate.result.error_map, plate.together.sites
     rows, known_before = _on_nodes(artifact, plate)
     common = new.known & np.tile(known_before, 2)
@@ -211,18 +237,42 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
     z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[:artifact.m.size]]
-    tests = ChangeTests(covariance, basis, dof, z)
-    in_datum = tests.without(values)
-    test = significance(in_datum, tests)
-    row = scale_row(modes)
-    scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
+    return common, values, ChangeTests(covariance, basis, dof, z)
 
-    out = np.full((2, len(common)), np.nan)
-    out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
-    changes, u = out.reshape(2, 2, *artifact.shape)
-    return Change(changes, u, test, 1.0 if test is None else tests.p(in_datum), scale, u_scale,
-                  2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
-                  None if test is None else tests)
+
+@dataclass(frozen=True, eq=False)
+class OtherCause:
+    """Effects of any size that explain a change of the XY map of a stage that is as it was.
+
+    Attributes
+    ----------
+    values, u : float array (e,)
+        Their sizes beyond what was assumed, and standard uncertainties.
+    p_none : float
+        Probability of as large ones if there are none.
+    p_left : float
+        Probability of as large a change as they leave, if they are the only cause.
+    """
+
+    values: np.ndarray
+    u: np.ndarray
+    p_none: float
+    p_left: float
+
+
+def change_by_effects(new: NewMap, artifact: Artifact, plate: KnownPlate,
+                      rows: Sequence[int]) -> OtherCause:
+    """Return the effects, of those in `rows`, that explain a change of the XY map best."""
+    common, values, tests = _compared(new, artifact, plate)
+    made = tests.without(new.moved[common[new.known]][:, rows])
+    change = tests.without(values)
+    white_made, white = (tests.white((part.T / tests.u).T) for part in (made, change))
+    information = white_made.T @ white_made
+    covariance = np.linalg.pinv(information, hermitian=True)
+    found = covariance @ (white_made.T @ white)
+    return OtherCause(found, np.sqrt(covariance.diagonal()),
+                      of_square(float(found @ information @ found), len(rows), tests.dof),
+                      tests.p(change - made @ found))
 
 
 def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray, old: np.ndarray, *,

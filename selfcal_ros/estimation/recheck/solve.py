@@ -13,7 +13,7 @@ import numpy as np
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariances, share_of
-from selfcal_ros.estimation.comparison.maps import joint_dof, of_square
+from selfcal_ros.estimation.comparison.maps import USUAL_LEVEL, joint_dof, of_square
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
     F_LEVEL,
@@ -28,11 +28,16 @@ from selfcal_ros.estimation.joint.problem import (
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
 from selfcal_ros.estimation.lattice.readings import Marks, angular_data, grid_data
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.angular import FLOOR
+from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE, lines_of, system_of
 from selfcal_ros.estimation.observability.plan_check import Prediction
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.recheck.change import line_change, map_change, recheck_found
+from selfcal_ros.estimation.recheck.change import (
+    change_by_effects,
+    line_change,
+    map_change,
+    recheck_found,
+)
 from selfcal_ros.estimation.recheck.plate import KnownPlate, check_plate, on_plate
 from selfcal_ros.estimation.recheck.views import (
     NOISE,
@@ -61,7 +66,7 @@ from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, first
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
-from selfcal_ros.model.terms import ModelTerm
+from selfcal_ros.model.terms import ModelTerm, block_of_offsets
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
 from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
 
@@ -84,6 +89,8 @@ class Rechecked:
         Both maps.
     xy, theta : NoiseEstimate
         Noise of one reading of each kind.
+    microscope : SeenMicroscope or None
+        The microscope, if visits show it; the measurements are then corrected by it.
     """
 
     measurements: Measurements
@@ -94,6 +101,7 @@ class Rechecked:
     lines: NewMap
     xy: NoiseEstimate
     theta: NoiseEstimate
+    microscope: "SeenMicroscope | None" = None
 
     @property
     def artifact(self) -> Artifact:
@@ -141,12 +149,18 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
                          "calibration", "leave it out")
     measurements = on_plate(measurements, plate)
     problem = _problem(measurements, options, plate)
+    seen = None if measurements.has_images else _seen_by_visits(problem)
+    if seen is not None:
+        sigma, dof = problem.repeats_xy
+        measurements = replace(measurements, views=tuple(map(seen.corrected, measurements.views)))
+        problem = replace(_problem(measurements, options, plate),
+                          repeats_xy=(min(sigma, seen.sigma), dof))
     xy, theta = _noise(measurements, problem, plate)
-    readings = _readings(measurements, problem, options, plate=plate, sigma=xy.sigma)
+    readings = _readings(measurements, problem, options, plate=plate, sigma=xy.sigma, seen=seen)
     solution = solve_marks(readings)
     return Rechecked(measurements, plate, readings, solution,
                      map_of_marks(readings, solution, xy.dof),
-                     _new_lines(readings, plate, theta), xy, theta)
+                     _new_lines(readings, plate, theta), xy, theta, seen)
 
 
 @one_thread()
@@ -176,13 +190,15 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
                           passes=min(view.view.repeats for view in measurements.views))
     noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     declared = {term.name for term in options.terms}
-    changes = _findings(found)
+    changes = _findings(found) + _off(solved)
     other = check_plate(solved.measurements, plate, solved.xy.sigma)
     failed = (other,) if other is not None else _misfit(
         solution.square, readings.dof,
         dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof)
     if not failed and found.changed and found.passes == 1 and "drift" not in declared:
         failed = (replace(changes[0], name="changed_or_drifted"),)
+    if found.changed:
+        failed += _by_microscope(solved, found, changes[0])
     unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
     terms = tuple(TermResult(
         str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
@@ -215,6 +231,51 @@ def _findings(found: Recheck) -> tuple[Finding, ...]:
     return out
 
 
+def _off(solved: Rechecked) -> tuple[Finding, ...]:
+    """Return a finding if visits show another microscope than is assumed."""
+    term = next((term for term in solved.readings.problem.terms if term.block.of_offsets), None)
+    if solved.microscope is None or term is None:
+        return ()
+    values = solved.microscope.values
+    u = np.sqrt(solved.microscope.covariance.diagonal())
+    sizes = [term.size_of(part) for part in SIMILAR]
+    if (np.abs(values[:2]) <= BEYOND * np.array(sizes)).all():
+        return ()
+    return (Finding("microscope_off", float(values[0]), float(u[0]), "m/m", details={
+        "turn": float(values[1]), "u_turn": float(u[1])}),)
+
+
+BEYOND = 3
+"""Sizes of the assumption from which on a microscope is another than is assumed."""
+SIMILAR = ("scale", "turn")
+"""Coefficients of a microscope that may be any once it has been touched."""
+SAME_VARIANCE = 1e-6
+"""Relative change of a variance at which its estimate ends."""
+
+
+def _by_microscope(solved: Rechecked, found: Recheck, changed: Finding) -> tuple[Finding, ...]:
+    """Return a finding if another microscope explains a change as well as a changed stage does.
+
+    Its scale and its turn may be any, if neither visits of one mark at several places nor the model
+    tells them: then nothing of the change of XY is left beyond its uncertainty, and they differ
+    from what was assumed. Lines have not changed.
+    """
+    readings, block = solved.readings, block_of_offsets()
+    columns = readings.columns.columns
+    rows = [row for row, column in enumerate(columns)
+            if column.term == block.name and column.component in SIMILAR]
+    of_lines = found.p_theta is not None and 2 * found.p_theta < USUAL_LEVEL
+    if not rows or of_lines or readings.shows_microscope:
+        return ()
+    other = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
+    if min(other.p_left, 1.0) < USUAL_LEVEL or other.p_none >= USUAL_LEVEL:
+        return ()
+    (scale, turn), (u_scale, u_turn) = readings.effects.mean[rows] + other.values, other.u
+    return (replace(changed, name="changed_or_microscope", details={
+        **changed.details, "scale": float(scale), "u_scale": float(u_scale),
+        "turn": float(turn), "u_turn": float(u_turn)}),)
+
+
 def _problem(measurements: Measurements, options: Options, plate: KnownPlate) -> Problem:
     """Return the problem that the readings of known marks pose."""
     grid, angular = grid_data(measurements), angular_data(measurements)
@@ -231,7 +292,7 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
 
 
 def _readings(measurements: Measurements, problem: Problem, options: Options, *,
-              plate: KnownPlate, sigma: float) -> PlateReadings:
+              plate: KnownPlate, sigma: float, seen: "SeenMicroscope | None") -> PlateReadings:
     """Return the readings with what has an effect on them, for the noise of one reading, m.
 
     The noise of a mark in images is the calibration's, and not none: the readings have to be
@@ -249,8 +310,8 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
         (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0))
     columns = _columns(problem, of_mark, of_stop)
     offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
-    known = columns.having(lambda block: block.of_offsets) & (
-        np.isfinite(offsets).all() and not declared)
+    of_offsets = columns.having(lambda block: block.of_offsets)
+    known = of_offsets & (np.isfinite(offsets).all() and not declared and seen is None)
     parts = np.array([MICROSCOPE_PARTS.index(columns.columns[at].component)
                       for at in np.flatnonzero(known)], dtype=int)
     source = np.where(columns.rows([PLATE]) | known, PLATE,
@@ -260,7 +321,85 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     before, now = plate.together.cover(sites, marks)[np.ix_(kept, kept)], plate.field[marks]
     effects = Effects.of(source, columns.size, np.concatenate([now.real, now.imag, offsets[parts]]),
                          before=before, length=plate.length_at(marks)[kept[start:] - start])
-    return PlateReadings(problem, measurements.sense, columns, effects, variance)
+    if seen is not None:
+        effects = effects.known_as(of_offsets, seen.covariance)
+    return PlateReadings(problem, measurements.sense, columns, effects, variance,
+                         shows_microscope=seen is not None)
+
+
+WELL = 1 / 3
+"""Uncertainty in sizes of the assumption from which on visits show the microscope."""
+ANY = 1.0
+"""Size of a scale and a turn of the microscope of which nothing is assumed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenMicroscope:
+    """A microscope as the visits of each mark show it by themselves.
+
+    Attributes
+    ----------
+    values, covariance : float array (4,), (4, 4)
+        Its coefficients.
+    sigma : float
+        Noise of one reading that it leaves between the visits, m.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    sigma: float
+
+    def corrected(self, view: ViewReadings) -> ViewReadings:
+        """Return the readings of a view as a right microscope would have given them."""
+        visits = view.visits
+        if visits is None or not len(visits.mark):
+            return view
+        scale, turn, stretch, shear = self.values
+        offset = visits.offset_x + 1j * visits.offset_y
+        missing = complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
+        number = np.bincount(visits.mark, visits.count, len(view.m))
+        dx, dy = (np.bincount(visits.mark, visits.count * part, len(view.m)) / np.maximum(number, 1)
+                  for part in (missing.real, missing.imag))
+        return replace(view, dx=view.dx + dx, dy=view.dy + dy, visits=replace(
+            visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag))
+
+
+def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
+    """Return the microscope that visits of one mark at several places show, as check stops do.
+
+    The motion of the stage has no noise of the detections: a reading changes with it by E / (1 + E)
+    of the motion. What other terms make of the visits is fitted beside it. None if the visits do
+    not tell its scale and turn well.
+    """
+    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
+    made.add_terms(problem.terms)
+    columns = made.done()
+    of_offsets, within = columns.having(lambda block: block.of_offsets), columns.within
+    if not of_offsets.any() or not within.dof:
+        return None
+    free = np.array([column.component in SIMILAR for column in columns.columns]) & of_offsets
+    size = np.where(free, ANY, columns.size)
+
+    found, covariance = np.zeros(len(size)), np.diag(size**2)
+    variance = within.total / within.dof
+    for _ in range(MAX_STEPS):  # the scatter that is left weighs the visits against the sizes
+        if not variance > FLOOR**2:
+            return None
+        covariance = np.linalg.inv(np.diag(size**-2) + within.gram / variance)
+        found = covariance @ within.right / variance
+        left = within.total - 2 * found @ within.right + found @ within.gram @ found
+        before, variance = variance, float(left) / within.dof
+        if abs(variance - before) <= SAME_VARIANCE * before:
+            break
+    slope = complex(*found[free])  # E / (1 + E)
+    values = found[of_offsets] / abs(1 - slope) ** 2
+    exact = slope / (1 - slope)
+    values[free[of_offsets]] = exact.real, exact.imag
+    covariance = covariance[np.ix_(of_offsets, of_offsets)] / abs(1 - slope) ** 4
+    u = np.sqrt(covariance.diagonal()[free[of_offsets]])
+    if (u > WELL * columns.size[free]).any():
+        return None
+    return SeenMicroscope(values, covariance, float(np.sqrt(variance)))
 
 
 def _require_noise(sigma: float) -> None:

@@ -63,6 +63,13 @@ class Effects:
         covariance[np.ix_(known, known)] = before[here:, here:]
         return cls(source, mean, covariance, before, length)
 
+    def known_as(self, here: np.ndarray, covariance: np.ndarray) -> "Effects":
+        """Return the effects with those `here`, bool (p,), known to be 0 by themselves."""
+        mean, all_known = np.where(here, 0.0, self.mean), self.covariance.copy()
+        all_known[here], all_known[:, here] = 0.0, 0.0
+        all_known[np.ix_(here, here)] = covariance
+        return replace(self, mean=mean, covariance=all_known)
+
     def projected(self, columns: tuple[np.ndarray, ...], response: np.ndarray,
                   inverse: np.ndarray, variance: float) -> tuple[np.ndarray, ...]:
         """Return what an estimate makes of a unit of each if it is not known, and what is left.
@@ -168,6 +175,8 @@ class PlateReadings:
         What is known of the former.
     variance : float
         Of the noise that each of those has by itself, m^2.
+    shows_microscope : bool
+        Whether visits of the same mark show the microscope, as check stops do.
     """
 
     problem: Problem
@@ -175,6 +184,7 @@ class PlateReadings:
     columns: TermColumns
     effects: Effects
     variance: float
+    shows_microscope: bool = False
 
     @cached_property
     def known(self) -> np.ndarray:

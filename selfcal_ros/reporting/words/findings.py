@@ -196,6 +196,8 @@ SENTENCES: dict[str, Words] = {
         "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
         f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"),
     "changed": phrases.changed_text, "changed_or_drifted": phrases.changed_or_drifted_text,
+    "microscope_off": phrases.microscope_off_text,
+    "changed_or_microscope": phrases.changed_or_microscope_text,
     "plate_misfit": phrases.misfit_text,
     "scale_changed": phrases.scale_changed_text, "other_plate": phrases.other_plate_text,
     "prediction_failed": lambda f, of: (

@@ -12,7 +12,7 @@ from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.verdict import BudgetLine, Finding
-from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, UM_PER_M
+from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
            "declared": "declared by the detections",
@@ -191,6 +191,24 @@ def changed_or_drifted_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
     return (f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
             f"(p = {found.p:.2g}); {ONE_PASS}")
+
+
+def changed_or_microscope_text(found: Finding, of: Mapping[str, Any]) -> str:
+    """Return the reason why a change that a microscope explains too is not qualified."""
+    return (f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
+            f"(p = {found.p:.2g}); a changed stage, or a microscope with a scale wrong by "
+            f"{of['scale']:+.1%} ± {of['u_scale']:.1%} and turned by "
+            f"{of['turn'] * MRAD_PER_RAD:+.2g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad (k=1) "
+            "explains it alike: measure check stops (check_stops in the plan), or correct the "
+            "pixel size")
+
+
+def microscope_off_text(found: Finding, of: Mapping[str, Any]) -> str:
+    """Return the warning of a microscope that is not as assumed, which the readings correct."""
+    return (f"the scale of the microscope is wrong by {found.size:+.2%} ± {found.u:.2%} and it is "
+            f"turned by {of['turn'] * MRAD_PER_RAD:+.3g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad "
+            "(k=1), as visits of one mark at several places show: the readings were corrected by "
+            "that; correct the pixel size before the next calibration")
 
 
 def _clearest_of(found: Finding, of: Mapping[str, Any]) -> str:

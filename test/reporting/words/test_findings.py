@@ -259,6 +259,7 @@ def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over()
                     and isinstance(node.args[0], ast.Constant)):
                 made.add(node.args[0].value)
     elsewhere = {"not_identified", "taken_for_slip", "changed_or_drifted",
+                 "changed_or_microscope",
                  "nonorthogonality", "scale_difference", "bending_x", "bending_y",
                  "add_views", "or_add_views", "add_views_or_fewer_nodes"}
     sentences = {*SENTENCES, *OF_OBSERVABILITY, "rest_not_identified"}
