@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
+from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup, bound_2d
+from selfcal_ros.aerotech.export import UNIFORM
 from selfcal_ros.aerotech.model import CalFile, Table, Table1D, Table2D
 from selfcal_ros.aerotech.one_axis import LEFT_OF_A_MAP, OneAxisFit, one_axis_fit
 from selfcal_ros.compensation.compensator import Compensator
+from selfcal_ros.compensation.export import fill_unknown
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.residual import (
     Correction,
@@ -62,7 +64,8 @@ class TableVerification:
     """Residuals at the sites, between them, and at the angular lines; None if not requested.
 
     `one_axis` is what tables of x and y leave if all of them are 1D: they correct only part of a
-    map.
+    map. `entries` is what 2D ones leave at their own entries that are not at sites, beyond the
+    difference of straight line and spline between these.
     """
 
     frame: MachineFrame
@@ -70,6 +73,7 @@ class TableVerification:
     between: Residual | None = None
     lines: Residual | None = None
     one_axis: OneAxisFit | None = None
+    entries: Residual | None = None
 
     @property
     def residuals(self) -> list[Residual]:
@@ -98,10 +102,13 @@ class TableVerification:
         """
         in_two_axes = self.sites if self.one_axis is None else None
         pairs = ((in_two_axes, (error_map.u_gx, error_map.u_gy)),
+                 (self.entries, (error_map.u_gx, error_map.u_gy)),
                  (self.lines, (error_map.u_g_theta,)))
-        return [residual for residual, u in pairs if residual is not None and any(
+        found = [residual for residual, u in pairs if residual is not None and any(
             size("after") > max(LEFT_OF_A_MAP * size("before"), limit * _rms_of(u))
             for size, limit in ((residual.rms, 2), (residual.largest, 4)))]
+        return [residual for residual in found
+                if residual is not self.entries or self.sites not in found]
 
 
 def _without_turn(position: np.ndarray, residual: np.ndarray) -> np.ndarray:
@@ -139,18 +146,61 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
                              f" from the positions of {list(table.inputs)}",
                              f"name the axes of the stage (now x={frame.x_axis}, "
                              f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})")
-    sites = between = lines = one_axis = None
+    sites = between = lines = one_axis = entries = None
     in_one_axis = [table for table in xy if isinstance(table, Table1D)]
     if xy:
         evaluator = CalEvaluator(xy, setup_of(frame))
         sites, *rest = plane_residuals(error_map, frame, plane_correction(evaluator, frame), active)
         between = rest[0] if rest else None
-    if in_one_axis and len(in_one_axis) == len(xy):
         error = error_map if active is None else combined(error_map, frame, active)
-        one_axis = one_axis_fit(error, in_one_axis, frame, setup_of(frame))
+        if len(in_one_axis) == len(xy):
+            one_axis = one_axis_fit(error, in_one_axis, frame, setup_of(frame))
+        else:
+            entries = _at_entries(error, xy, frame, evaluator)
     if theta:
         lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
-    return TableVerification(frame, sites, between, lines, one_axis)
+    return TableVerification(frame, sites, between, lines, one_axis, entries)
+
+
+def _at_entries(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
+                evaluator: CalEvaluator) -> Residual | None:
+    """Return what tables leave at the entries of 2D ones between the sites; None if none are there.
+
+    Between the sites the error of the stage is known to the difference of the bilinear map and the
+    spline through its sites.
+    """
+    whole, _ = fill_unknown(error_map)
+    plate = whole.artifact
+    plane = replace(whole, artifact=replace(plate, angular_count=0, harmonics=0),
+                    g_theta=np.zeros(0), u_g_theta=np.zeros(0))
+    nodes = plate.x_m[:, 0], plate.y_m[0]
+    places = [np.stack([plate.x_m.ravel(), plate.y_m.ravel()])]
+    for table in tables:
+        if isinstance(table, Table2D):
+            bound = bound_2d(table, setup_of(frame))
+            along = {track.axis: track.first + track.step * np.arange(track.count)
+                     for track in (bound.rows, bound.columns)}
+            entries = frame.from_machine(along[frame.x_axis], along[frame.y_axis])
+            inside = [p[(p > side[0]) & (p < side[-1])]
+                      for p, side in zip(entries, nodes, strict=True)]
+            places.append(np.stack(np.meshgrid(*inside)).reshape(2, -1))
+    sites, position = plate.x_m.size, np.concatenate(places, axis=1)
+    pitches = (position[:, sites:] - position[:, :1]) / plate.grid_pitch_m
+    between = (np.abs(pitches - np.round(pitches)) > UNIFORM).any(axis=0)
+    position = position[:, np.append(np.full(sites, True), between)]
+    if not between.any():
+        return None
+    px, py = frame.to_machine(*position)
+    cx, cy = plane_correction(evaluator, frame)(px, py)
+    added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
+    error = np.stack(Compensator(plane).error(*position))
+    doubt = np.abs(np.stack(Compensator(plane, method="bicubic").error(*position)) - error)
+    left = error - added
+    left = left - left[:, :sites].mean(axis=1, keepdims=True)
+    left = np.sign(left) * np.maximum(np.abs(left) - doubt, 0.0)
+    mean = error[:, :sites].mean(axis=1)
+    return Residual("entries", position[:, sites:], (error - mean[:, None])[:, sites:],
+                    left[:, sites:], mean, np.zeros(2))
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""1D tables of x and y: right ones pass, wrong ones do not, whatever they leave of the rest."""
+"""1D tables of x and y, and fine 2D ones: right ones pass, wrong ones do not, whatever is left."""
 
 from dataclasses import replace
 
@@ -11,6 +11,7 @@ from selfcal_ros.aerotech.export import (
     line_table,
     map_line,
     map_orthogonality,
+    table_xy,
     without_slope,
 )
 from selfcal_ros.aerotech.verify import verify_tables
@@ -139,6 +140,26 @@ def test_a_wrong_entry_between_the_nodes_does_not_pass():
     values = table.values.copy()
     values[7] += 1.0
     assert unfit(error_map, [replace(table, values=values)], frame) == ["x from the position of x"]
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("entry", [(3, 3), (3, 4), (4, 3)])
+def test_a_wrong_entry_of_a_fine_2d_table_does_not_pass(frame, entry):
+    """Between the sites, in the middle of a cell and on its edges; a right one passes."""
+    error_map = stage()
+    table = table_xy(error_map, frame)
+    values = table.values
+    for axis in (0, 1):
+        fine = np.arange(2 * values.shape[axis] - 1) / 2
+        values = np.apply_along_axis(
+            lambda line, fine=fine: np.interp(fine, np.arange(len(line)), line), axis, values)
+    table = replace(table, values=values, sample_row=table.sample_row / 2,
+                    sample_col=table.sample_col / 2)
+    assert verify_tables(error_map, [table], frame).unfit(error_map) == []
+    values = values.copy()
+    values[entry] += 1.0
+    found = verify_tables(error_map, [replace(table, values=values)], frame)
+    assert [residual.place for residual in found.unfit(error_map)] == ["entries"]
 
 
 def test_what_is_within_u_of_the_map_is_not_blamed():
