@@ -31,7 +31,6 @@ from selfcal_ros.estimation.checks.wiring import LEAST_NOISE_M
 from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.normal.equations import (
     BLOCK,
-    Memo,
     NormalEquations,
     in_datum,
 )
@@ -355,9 +354,6 @@ class Conditions:
     phi_gain: np.ndarray
 
 
-_of_system: Memo[tuple[ThetaDatum, Sense, float], Conditions] = Memo()
-
-
 def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
                    half_width_m: float) -> Conditions:
     """Return the conditions of a datum for the measured plan.
@@ -378,12 +374,6 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     InputError
         For ``xy_axes`` if a half axis has no sites or no line, or is not completely determined.
     """
-    return _of_system.get(system, (datum, sense, half_width_m),
-                          lambda: _conditions(system, datum, sense, half_width_m))
-
-
-def _conditions(system: NormalEquations, datum: ThetaDatum, sense: Sense,
-                half_width_m: float) -> Conditions:
     known, n_lines = system.known_lines, system.angular.n_lines
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:

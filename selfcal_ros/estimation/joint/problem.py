@@ -23,7 +23,7 @@ from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import NormalEquations, angular_residuals
+from selfcal_ros.estimation.normal.equations import NormalEquations, angular_residuals, noise_of
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options, ReferenceLength
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
@@ -635,13 +635,12 @@ def noise_gain(problem: Problem, found: JointFit) -> np.ndarray:
     places, grid = problem.places, problem.system.grid
     if places is None or not problem.moves or places.distance < FAR:
         return np.ones(grid.views.shape)
-    rng, spread = np.random.default_rng(0), np.zeros(grid.weight.shape)
-    spread[grid.read] = max(found.xy.sigma, np.finfo(float).tiny) / np.sqrt(grid.weight[grid.read])
+    rng, sigma_m = np.random.default_rng(0), max(found.xy.sigma, np.finfo(float).tiny)
     lines = angular_part(problem)
     still = replace(lines, free=0 * lines.free, d=0 * lines.d)
     there, sums = places.errors(found.field), np.zeros((2, *grid.views.shape))
     for _ in range(math.ceil(SAMPLES / grid.n_sites)):
-        y = spread * (rng.normal(size=spread.shape) + 1j * rng.normal(size=spread.shape))
+        y = sigma_m * noise_of(rng, grid.weight.shape, grid.weight)
         plain = now = fit(problem, y, still).field
         for _ in range(MAX_STEPS):
             changes = places.changes(places.moved(now, there), problem.turn_rad)

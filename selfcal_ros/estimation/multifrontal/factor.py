@@ -400,22 +400,20 @@ class Factor:
         return out.reshape(right.shape)
 
     def _forward(self, work: np.ndarray) -> None:
-        real, lanes = work.view(float), _lanes(work)
+        real = work.view(float)
         for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
             own = inverse @ real[front.start:front.stop]
             real[front.start:front.stop] = own
             if len(below):
-                update = (below @ own).view(complex).reshape(-1, *lanes.shape[1:])
-                lanes[front.boundary] = lanes.take(front.boundary, axis=0) - update
+                real[front.boundary] -= below @ own
 
     def _backward(self, work: np.ndarray) -> None:
-        real, lanes = work.view(float), _lanes(work)
+        real = work.view(float)
         for front, (inverse, below) in zip(reversed(self.dissection.fronts),
                                            reversed(self._blocks), strict=True):
             own = real[front.start:front.stop]
             if len(below):
-                later = lanes.take(front.boundary, axis=0).view(float)
-                own = own - below.T @ later.reshape(len(below), -1)
+                own = own - below.T @ real[front.boundary]
             real[front.start:front.stop] = inverse.T @ own
 
     @cached_property
@@ -471,11 +469,6 @@ class Factor:
         return z
 
 
-def _lanes(work: np.ndarray) -> np.ndarray:
-    """Return (n, k) as (n,) if k is 1: indexing scalars is faster than rows."""
-    return work.reshape(-1) if work.shape[1] == 1 else work
-
-
 def _mirrored(lower: np.ndarray) -> np.ndarray:
     """Return the Hermitian matrix with this lower triangle; the upper one is zero."""
     out = lower + lower.conj().T
@@ -514,29 +507,12 @@ def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
     lower, info = lapack.dpotrf(f11, lower=1, overwrite_a=1)
     if info:
         raise np.linalg.LinAlgError("the normal matrix is not positive definite")
-    inverse = _inverse(lower)
+    inverse = lapack.dtrtri(lower, lower=1, overwrite_c=1)[0]
     if not len(f21):
         return inverse, f21, f22
     below = blas.dtrmm(1.0, inverse, f21, side=1, lower=1, trans_a=1, overwrite_b=1)
     rest = blas.dsyrk(-1.0, below, beta=1.0, c=f22, lower=1, overwrite_c=1)
     return inverse, below, rest
-
-
-def _inverse(lower: np.ndarray) -> np.ndarray:
-    """Return the inverse of a lower triangular matrix, which is overwritten.
-
-    Recursive by halves: matrix products are faster than substitution, but for a small one.
-    """
-    n = len(lower)
-    if 3 * n <= LEAF:
-        return lapack.dtrtri(lower, lower=1, overwrite_c=1)[0]
-    half = n // 2
-    first = _inverse(np.asfortranarray(lower[:half, :half]))
-    last = _inverse(np.asfortranarray(lower[half:, half:]))
-    below = blas.dtrmm(1.0, first, lower[half:, :half], side=1, lower=1)
-    lower[half:, :half] = blas.dtrmm(-1.0, last, below, lower=1, overwrite_b=1)
-    lower[:half, :half], lower[half:, half:] = first, last
-    return lower
 
 
 _lock = RLock()

@@ -350,6 +350,13 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     return angular.plate(y, *angular.fitted(y, system.angular_inverse))[1]
 
 
+def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+    """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
+    root = np.sqrt(np.where(weight > 0, weight, 1.0))
+    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
+    return both[0] + 1j * both[1]
+
+
 CORE = 0.75
 """Distance from the centre, in half widths, within which nodes fix the first datum."""
 

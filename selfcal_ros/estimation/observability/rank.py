@@ -23,7 +23,6 @@ from selfcal_ros.estimation.lattice.maps import PHASES
 from selfcal_ros.estimation.normal.angular import GAP, AngularSystem, HarmonicSystem
 from selfcal_ros.estimation.normal.equations import (
     FULL_SIZE,
-    Memo,
     NormalEquations,
     planned_system,
     pseudo_inverse,
@@ -42,8 +41,6 @@ DETERMINED = 0.5
 
 NARROW = 5
 """Smallest number of sites across a reduced field."""
-
-_measured: Memo[tuple[Artifact, tuple[View, ...]], Observability] = Memo()
 
 
 def plan_observability(plan: Plan) -> Observability:
@@ -154,8 +151,7 @@ def measured_observability(system: NormalEquations, artifact: Artifact,
     views : tuple of View
         The views that were read.
     """
-    return _measured.get(system, (artifact, views), lambda: with_unchecked(
-        _measured_observability(system, artifact, views), system))
+    return with_unchecked(_measured_observability(system, artifact, views), system)
 
 
 def with_unchecked(seen: Observability, system: NormalEquations) -> Observability:

@@ -35,7 +35,12 @@ from selfcal_ros.estimation.joint.problem import Problem
 from selfcal_ros.estimation.joint.solve import fit_joint, prepare
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_FULL, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import TRACE, Memo, NormalEquations, grid_residuals
+from selfcal_ros.estimation.normal.equations import (
+    TRACE,
+    NormalEquations,
+    grid_residuals,
+    noise_of,
+)
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.causes import (
     MAX_CAUSES,
@@ -53,7 +58,6 @@ from selfcal_ros.estimation.verdict.leverage import (
     Alone,
     lines_alone,
     marks_alone,
-    noise_of,
 )
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import (
@@ -106,7 +110,7 @@ def view_noise(residuals: Residuals) -> np.ndarray:
     from scipy.optimize import nnls  # a tenth of a second, for this alone
 
     system, grid = residuals.problem.system, residuals.problem.system.grid
-    mixing = _mixings.get(system, None, lambda: _mixing(system))
+    mixing = _mixing(system)
     sums = (abs(residuals.marks.residual) ** 2 * grid.weight).sum(axis=(1, 2))
     out = np.empty((grid.n_views, 3))
     for v in range(grid.n_views):
@@ -116,9 +120,6 @@ def view_noise(residuals: Residuals) -> np.ndarray:
         out[v, :2] = np.sqrt(nnls(normal, group.T @ sums)[0])
         out[v, 2] = normal[0, 0] - normal[0, 1] ** 2 / max(normal[1, 1], 1e-300)
     return out
-
-
-_mixings: Memo[None, np.ndarray] = Memo()
 
 
 def _mixing(system: NormalEquations) -> np.ndarray:

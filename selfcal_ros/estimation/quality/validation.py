@@ -35,14 +35,14 @@ from selfcal_ros.estimation.lattice.readings import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, lines_of
+from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, lines_of, noise_of
 from selfcal_ros.estimation.observability.plan_check import SEARCH_SIZE, candidate_views
 from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
 from selfcal_ros.estimation.terms.places import places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
-from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, noise_of
+from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult

@@ -16,7 +16,7 @@ readings give another size: that at which b' (C + size^2 1)^-1 b equals its rank
 1982), and at most that at which it is improbably small.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -122,8 +122,8 @@ class ProjectedColumns:
 
     Attributes
     ----------
-    make_fields : callable
-        Returns `fields`, which are rarely needed.
+    fields : complex array (sites, p)
+        Map F.
     parameters : float array (size, p)
         Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
@@ -132,15 +132,10 @@ class ProjectedColumns:
         Angular map of each column, sign reversed, rad.
     """
 
-    make_fields: Callable[[], np.ndarray]
+    fields: np.ndarray
     parameters: np.ndarray
     gram: np.ndarray
     turned: np.ndarray
-
-    @cached_property
-    def fields(self) -> np.ndarray:
-        """Map F, complex (sites, p)."""
-        return self.make_fields()
 
     def of_lines(self, system: NormalEquations, lines: LineColumns,
                  half_width_m: float) -> np.ndarray:
@@ -179,8 +174,8 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
     gram[np.ix_(lines.at, lines.at)] += ratio * half_width_m**2 * gram_of_lines
     turned = angular.response @ parameters[system.phi_at] / half_width_m
     turned[:, lines.at] -= free
-    return ProjectedColumns(lambda: reduced.free - system.grid.response @ parameters[:n],
-                            parameters, (gram + gram.T) / 2, turned)
+    return ProjectedColumns(reduced.free - system.grid.response @ parameters[:n], parameters,
+                            (gram + gram.T) / 2, turned)
 
 
 def lines_eliminated(angular: AngularSystem,

@@ -18,6 +18,7 @@ from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     angular_residuals,
     grid_residuals,
+    noise_of,
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
 
@@ -152,10 +153,3 @@ def angular_redundancy(system: NormalEquations) -> np.ndarray:
         mean = 1 - system.rank_angular / max(angular.n_readings, 1)
         return np.where(angular.read, mean, 0.0)
     return exact_leverage(angular, system.angular_inverse)[0]
-
-
-def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
-    """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
-    root = np.sqrt(np.where(weight > 0, weight, 1.0))
-    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
-    return both[0] + 1j * both[1]

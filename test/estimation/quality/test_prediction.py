@@ -8,9 +8,9 @@ import pytest
 
 from selfcal_ros.estimation.joint.model_fit import ModelFit
 from selfcal_ros.estimation.lattice.readings import GridData, grid_data
+from selfcal_ros.estimation.normal.equations import noise_of
 from selfcal_ros.estimation.quality import validation
 from selfcal_ros.estimation.quality.validation import HeldReadings, PredictionLimit
-from selfcal_ros.estimation.verdict.leverage import noise_of
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm
