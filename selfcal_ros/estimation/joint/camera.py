@@ -142,11 +142,10 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     image = readings[0].view.image
     if image is None or min(image.nx, image.ny) < 3:
         return None
-    turn = grid.views.phases * np.exp(1j * problem.turn_rad)
 
     def offsets(parameters: np.ndarray) -> np.ndarray:
         """Return the offsets of the sub-views for misalignments (..., size)."""
-        return turn * (parameters[..., 1:3 * grid.n_views:3]
+        return problem.to_stage * (parameters[..., 1:3 * grid.n_views:3]
                        + 1j * parameters[..., 2:3 * grid.n_views:3])
 
     noises = images.noises(model.found.residuals)

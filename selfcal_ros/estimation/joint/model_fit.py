@@ -357,11 +357,6 @@ class FinerEquations(PlacedEquations):
     """Equations of a refined map, of which the readings may determine only a part."""
 
     @cached_property
-    def told(self) -> float:
-        """Real coefficients of the map that the readings determine."""
-        return told_coefficients(self)
-
-    @cached_property
     def known_sites(self) -> np.ndarray:
         """Nodes with readings near them, which are fitted whether they are known or not."""
         return (self.grid.components.of_site >= 0).reshape(self.grid.views.shape)
@@ -369,7 +364,8 @@ class FinerEquations(PlacedEquations):
     @cached_property
     def rank_grid(self) -> int:
         """Rank of the grid readings, coefficients counted as far as they are determined."""
-        return round(self.told) + 2 * int(self.grid.mark_read.sum()) + self.rank_schur
+        of_plate = 2 * int(self.grid.mark_read.sum())
+        return round(told_coefficients(self)) + of_plate + self.rank_schur
 
 
 def told_coefficients(system: PlacedEquations) -> float:

@@ -253,14 +253,9 @@ class Problem:
         return self.half_width_m * float(np.abs(self.turn_rad).max(initial=0.0))
 
     @property
-    def frames(self) -> np.ndarray:
-        """exp(-i turn_rad) of each grid view: from the nominal to the turned plate frame."""
-        return np.exp(-1j * self.turn_rad)
-
-    @property
     def to_stage(self) -> np.ndarray:
         """Factor from the turned plate frame of each view's readings to the stage frame."""
-        return self.system.grid.views.phases / self.frames
+        return self.system.grid.views.phases * np.exp(1j * self.turn_rad)
 
     def excess(self, parameters: np.ndarray, plate: np.ndarray,
                stage: np.ndarray) -> np.ndarray | float:

@@ -590,8 +590,7 @@ def views_of(measurements: Measurements, problem: Problem,
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
         phi[i] = parameters[3 * row] + problem.turn_rad[row] * problem.half_width_m
-        turn = problem.grid.poses[row].phase * np.exp(1j * problem.turn_rad[row])
-        offset[i] = turn * complex(*parameters[3 * row + 1:3 * row + 3])
+        offset[i] = problem.to_stage[row] * complex(*parameters[3 * row + 1:3 * row + 3])
     nan = complex(np.nan, np.nan)
     return tuple(
         ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m,

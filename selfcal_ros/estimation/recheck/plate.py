@@ -71,26 +71,33 @@ class KnownPlate:
         """
         plate, lattice = self.result.artifact_map, self.result.plate
         longer = 0.0
-        if self.reference is not None and self.result.reference is not None:
-            longer = self.reference["relative_error"] - self.result.reference["relative_error"]
+        if self._lengths is not None:
+            now, then = (each["relative_error"] for each in self._lengths)
+            longer = now - then
         nominal = lattice.x_m + 1j * lattice.y_m
         return np.where(self.together.marks, plate.ax + 1j * plate.ay + longer * nominal,
                         complex(np.nan, np.nan))
 
     @property
+    def _lengths(self) -> tuple[dict[str, Any], dict[str, Any]] | None:
+        """Reference lengths now and at the calibration; None if one is not known."""
+        now, then = self.reference, self.result.reference
+        return None if now is None or then is None else (now, then)
+
+    @property
     def variance_of_length(self) -> float:
         """Variance of the plate's length now beyond that at its calibration, 1 = (m/m)^2."""
-        if self.reference is None or self.result.reference is None:
+        if self._lengths is None:
             return 0.0
-        now, then = (each["u_relative"] for each in (self.reference, self.result.reference))
+        now, then = (each["u_relative"] for each in self._lengths)
         return max(now**2 - then**2, 0.0)
 
     @property
     def variance_of_expansion(self) -> float:
         """Variance of the expansion since the calibration, by both temperatures, (m/m)^2."""
-        if self.reference is None or self.result.reference is None:
+        if self._lengths is None:
             return 0.0
-        now, then = (each["certified"] for each in (self.reference, self.result.reference))
+        now, then = (each["certified"] for each in self._lengths)
         u_kelvin = np.hypot(now["u_temperature_k"], then["u_temperature_k"])
         warmer = now["temperature_c"] - then["temperature_c"]
         return float((now["expansion_per_k"] * u_kelvin)**2
