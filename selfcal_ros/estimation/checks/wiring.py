@@ -390,17 +390,32 @@ def _undone(view: ViewReadings, wiring: Turned) -> ViewReadings:
         view.motion_theta, np.array([[wiring.of_lines]])))
     if view.visits is None:
         return view
+    x, y = (back - np.eye(2)) @ np.stack([view.visits.offset_x, view.visits.offset_y])
+    return with_offsets(view, view.visits, x + 1j * y, back)
 
-    visits = view.visits
-    offset = np.stack([visits.offset_x, visits.offset_y])
-    change = (back - np.eye(2)) @ offset
-    weight = visits.count / np.bincount(visits.mark, visits.count, len(view.m))[visits.mark]
-    dx, dy = (np.bincount(visits.mark, weight * row, len(view.m)) for row in change)
-    x, y = back @ offset
-    turned: GridVisits = replace(visits, dx=visits.dx + change[0], dy=visits.dy + change[1],
-                                 offset_x=x, offset_y=y)
-    return replace(view, dx=view.dx + dx, dy=view.dy + dy, visits=turned,
-                   motion=_turned_motion(view.motion, back))
+
+def with_offsets(view: ViewReadings, visits: GridVisits, change: np.ndarray,
+                 back: np.ndarray) -> ViewReadings:
+    """Return the readings of a view with other offsets.
+
+    Parameters
+    ----------
+    view, visits : ViewReadings, GridVisits
+        The readings, and their visits.
+    change : complex array (V,)
+        What the offset of each visit, and with it the deviation, gains, stage axes, m.
+    back : float array (2, 2)
+        Slope of the other offsets on these.
+    """
+    weight = visits.u**-2 if len(visits.u) and np.isfinite(visits.u).all() else visits.count
+    total = np.bincount(visits.mark, weight, len(view.m))
+    dx, dy = (np.bincount(visits.mark, weight * part, len(view.m)) / total
+              for part in (change.real, change.imag))
+    return replace(
+        view, dx=view.dx + dx, dy=view.dy + dy, motion=_turned_motion(view.motion, back),
+        visits=replace(visits, dx=visits.dx + change.real, dy=visits.dy + change.imag,
+                       offset_x=visits.offset_x + change.real,
+                       offset_y=visits.offset_y + change.imag))
 
 
 def _turned_motion(motion: RepeatMotion | None, back: np.ndarray) -> RepeatMotion | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
+from selfcal_ros.estimation.checks.wiring import with_offsets
 from selfcal_ros.estimation.joint.model_fit import ModelFit, squares
 from selfcal_ros.estimation.joint.problem import F_LEVEL, NEGLIGIBLE
 from selfcal_ros.estimation.normal.angular import MAX_STEPS
@@ -280,24 +281,14 @@ def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
               place: complex) -> ViewReadings:
     offset = view.view.cell_m + visits.offset_x + 1j * visits.offset_y
     excess = camera.at(offset) - camera.at(np.array([place]))
-    weight = visits.u**-2 if len(visits.u) and np.isfinite(visits.u).all() else visits.count
-    total = np.bincount(visits.mark, weight, len(view.m))
-    dx, dy = (np.bincount(visits.mark, weight * part, len(view.m)) / total
-              for part in (excess.real, excess.imag))
-    motion = view.motion and replace(
-        view.motion, products=straight_products(view.motion.products, camera, place))
-    return replace(view, dx=view.dx - dx, dy=view.dy - dy, motion=motion, visits=replace(
-        visits, dx=visits.dx - excess.real, dy=visits.dy - excess.imag,
-        offset_x=visits.offset_x - excess.real, offset_y=visits.offset_y - excess.imag))
+    return with_offsets(view, visits, -excess, straight_slope(camera, place))
 
 
-def straight_products(products: np.ndarray, camera: Distortion, place: complex) -> np.ndarray:
-    """Return products of positions and offsets with the slope of the camera's error removed."""
+def straight_slope(camera: Distortion, place: complex) -> np.ndarray:
+    """Return the slope of straightened offsets on published ones at a place, float (2, 2)."""
     step = STEP_M * np.array([1, 1j])
     slope = (camera.at(place + step) - camera.at(place - step)) / (2 * STEP_M)
-    change = np.eye(4)
-    change[2:, 2:] -= np.stack([slope.real, slope.imag])
-    return change @ products @ change.T
+    return np.eye(2) - np.stack([slope.real, slope.imag])
 
 
 def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[Finding, ...]:

@@ -12,7 +12,7 @@ from scipy.stats import binom, chi2
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import covariance_of
-from selfcal_ros.estimation.joint.camera import Distortion, straight_products
+from selfcal_ros.estimation.joint.camera import Distortion, straight_slope
 from selfcal_ros.estimation.joint.images import image_noise
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
@@ -247,7 +247,9 @@ def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
         published = true + camera.at(published)
     moved, seen = -(true - true.mean()), published - published.mean()
     rows = np.stack([moved.real, moved.imag, seen.real, seen.imag])
-    slopes = straight_products(rows @ rows.T, camera, complex(published.mean()))
+    straight = np.eye(4)
+    straight[2:, 2:] = straight_slope(camera, complex(published.mean()))
+    slopes = straight @ rows @ rows.T @ straight.T
     on_motion = np.linalg.solve(slopes[:2, :2], slopes[:2, 2:])
     np.testing.assert_allclose(on_motion, -np.eye(2), atol=2e-5)
     assert abs(np.linalg.solve(slopes[:2, :2], (rows @ rows.T)[:2, 2:]) + np.eye(2)).max() > 0.02
