@@ -195,6 +195,7 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
         Whether angular lines are measured as well; then a turn by one line is included, or by
         `OTHER_TURN_DEG` for a Fourier map.
     """
+    angular = angular and artifact.angular_count > 0
     pitch = artifact.grid_pitch_m
     beside = artifact.quarter_shift * pitch
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
@@ -204,7 +205,7 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
              for (a, b), name in names.items() for q in range(4)
              if q % 2 == 0 or artifact.marks or artifact.shape[0] == artifact.shape[1]
              or (a, b) == (0, 0)]
-    if angular and artifact.angular_count:
+    if angular:
         line = 2 * math.pi / artifact.angular_count
         views.append(View("one_line", line, (0.0, 0.0), False, True) if not artifact.harmonics else
                      View(f"{OTHER_TURN_DEG}deg", math.radians(OTHER_TURN_DEG), grid=False))
@@ -218,7 +219,7 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     by one line is added if the angular map needs it, and every set is verified on the plan's
     own field, so the result is exact.
     """
-    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+    angular = any(view.angular for view in plan.views)
     image = next((view.image for view in plan.views if view.grid), None)
     candidates = [replace(view, image=image if view.grid else None)
                   for view in candidate_views(plan.artifact, angular=angular)]
@@ -267,7 +268,7 @@ class Step:
 
 def more_views(plan: Plan) -> list[Step]:
     """Return the views that may be added."""
-    angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+    angular = any(view.angular for view in plan.views)
     out = []
     like = next((view for view in plan.views if view.grid), View(""))
     for view in candidate_views(plan.artifact, angular=angular):

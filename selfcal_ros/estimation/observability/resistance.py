@@ -15,8 +15,6 @@ stops, another visiting order, a further view.
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from scipy.special import fdtri
@@ -200,11 +198,8 @@ class PlannedTerms:
                - beside.rank() - rank)
         if rank == 0 or dof <= 0:
             return 0.0
-        squares, state = _squares(rank)
-        ratio = (size / self.assumed.sigma_m) ** 2
-        explained = squares @ (1 + ratio * values)
-        rng = np.random.default_rng()
-        rng.bit_generator.state = state
+        rng, ratio = np.random.default_rng(1), (size / self.assumed.sigma_m) ** 2
+        explained = rng.chisquare(1, (DRAWS, rank)) @ (1 + ratio * values)
         noise = rng.chisquare(dof, DRAWS) / dof
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
@@ -228,13 +223,6 @@ class PlannedTerms:
         scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
         rank = int((scaled > every.limit(term)).sum())
         return np.linalg.eigvalsh(rest)[len(rest) - rank:], rank
-
-
-@lru_cache(maxsize=8)
-def _squares(rank: int) -> tuple[np.ndarray, Mapping[str, Any]]:
-    """Return chi^2(1) draws (DRAWS, rank), and the state of their generator after them."""
-    rng = np.random.default_rng(1)
-    return rng.chisquare(1, (DRAWS, rank)), rng.bit_generator.state
 
 
 def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) -> Prediction:
