@@ -19,7 +19,7 @@ from selfcal_ros.errors import InputError, known_are
 ENTRY_POINTS = "selfcal.blocks"
 
 BUILT_IN = ("microscope", "drift", "plate_scale", "plate_shape", "approach", "plate_strain",
-            "line_eccentricity", "rotation", "yaw")
+            "line_eccentricity", "line_scale", "rotation", "yaw")
 """Modules of `selfcal_ros.estimation.terms`, in the order in which terms are listed."""
 
 SHARED = -1
@@ -162,6 +162,16 @@ class Block:
     cure: str = ""
     sentence: Callable[[Any], str] | None = None
     action: str = ""
+
+    @property
+    def of_microscope(self) -> bool:
+        """Whether its columns are made of the offsets of marks."""
+        return self.of_offsets and not self.of_lines
+
+    @property
+    def turns_lines(self) -> bool:
+        """Whether it turns the lines of a view against its marks."""
+        return self.of_lines and (self.between or self.of_offsets)
 
     @property
     def by_placing(self) -> bool:

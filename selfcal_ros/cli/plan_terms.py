@@ -164,7 +164,7 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
         The plan: its images may tell the microscope better than it is known.
     """
     names = {term.name for term in named} | ({
-        block.name for block in blocks().values() if block.of_offsets and tells_camera(plan)})
+        block.name for block in blocks().values() if block.of_microscope and tells_camera(plan)})
     return () if _is_none(given) else tuple(
         term for term in default_terms() if term.name not in names)
 

@@ -331,7 +331,7 @@ def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Ex
     _count(rejected, Reason.OUTLIER, means.outlier)
     place = identify.wrap(v - d["ot"])  # of the axis relative to the line, without full turns
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
-    about = place[~means.outlier].mean() if artifact.harmonics and len(means.key) else 0.0
+    about = place[~means.outlier].mean() if len(means.key) else 0.0
     return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
             "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,
             "motion_theta": motion, "outliers_theta": _outliers_of(means, k),

@@ -83,7 +83,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         (scale, turn), other = camera.u_coefficients[1:3]
         known = microscope_term(float(scale), float(turn), float(other.max()))
         options = replace(options, assumed=tuple(
-            known if term.block.of_offsets else term for term in options.assumed))
+            known if term.block.of_microscope else term for term in options.assumed))
     solved = solve_joint(measurements, options)
     converged = solved.converged
     if not converged:  # first: with a wrong wiring the search for causes takes seconds

@@ -199,8 +199,8 @@ class ViewReadings:
     places : RejectedPlaces
         Positions of rejected grid detections; empty if unknown.
     axis_theta : float
-        With harmonics, the indicated angle of the axis about the nominal one in the frame of the
-        equations, mean of the lines, rad.
+        Indicated angle of the axis about the nominal one in the frame of the equations, mean of the
+        lines, rad; 0 if unknown.
     outliers, outliers_theta : int array (P,) or (0,), (Q,) or (0,)
         Outliers among the repeats of each mark and line, additional to the count; empty if unknown.
     motion, motion_theta : RepeatMotion, optional

@@ -115,8 +115,8 @@ def default_terms() -> tuple[ModelTerm, ...]:
 
 
 def block_of_offsets() -> Block:
-    """Return the block whose columns are made of the measured offsets."""
-    return next(block for block in blocks().values() if block.of_offsets)
+    """Return the block whose columns are made of the measured offsets of marks."""
+    return next(block for block in blocks().values() if block.of_microscope)
 
 
 def microscope_term(*parts: float) -> ModelTerm:

@@ -213,7 +213,7 @@ def _model_texts(result: CalibrationResult) -> list[str]:
         if block is not None and block.of_lines and not result.plate.angular_count:
             continue
         size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
-        of_images = block is not None and block.of_offsets and result.camera is not None
+        of_images = block is not None and block.of_microscope and result.camera is not None
         source = "determined by the images" if of_images and term.source == "default" else (
             term.source)
         texts.append(f"term {term.name}: {size}, {source}")

@@ -71,7 +71,8 @@ def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
         result = json.loads(out.read_text())
         found[name] = ([term["name"] for term in result["model"]["terms"]],
                        result["provenance"].get("model_terms_from"))
-    assumed = ["microscope", "plate_shape", "plate_strain", "line_eccentricity", "rotation"]
+    assumed = ["microscope", "plate_shape", "plate_strain", "line_eccentricity", "line_scale",
+               "rotation"]
     assert found == {"plan": (["plate_scale", *assumed], "plan"),
                      "options": (["drift", *assumed], "options"), "none": ([], None)}
 

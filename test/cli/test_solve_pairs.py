@@ -38,7 +38,8 @@ FACTORS = {
     "report": ([], ["--report", "r.html"]),
     "quiet": ([], ["--quiet"]),
     "json": ([], ["--json"])}
-ASSUMED = {"microscope", "plate_shape", "plate_strain", "line_eccentricity", "rotation"}
+ASSUMED = {"microscope", "plate_shape", "plate_strain", "line_eccentricity", "line_scale",
+           "rotation"}
 """What is in the model unless it is none, or linear."""
 CLASHES = {("reference", 1), ("reference", 2), ("model", 1), ("model", 2), ("model", 3),
            ("misalignment", 2), ("robust", 1), ("validate", 1)}

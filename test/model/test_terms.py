@@ -22,7 +22,7 @@ def test_a_name_that_nobody_knows():
         ModelTerm("creep")
     assert str(caught.value) == ("model: the term 'creep' is unknown; known are microscope, "
                                  "drift, plate_scale, plate_shape, approach, plate_strain, "
-                                 "line_eccentricity, rotation, yaw")
+                                 "line_eccentricity, line_scale, rotation, yaw")
 
 
 def test_a_microscope_has_three_sizes():
@@ -54,9 +54,10 @@ def test_a_size_of_0_says_that_there_is_no_such_term():
     assert [(term.name, term.size, term.free) for term in terms] == [
         ("drift", 1e-9, False), ("plate_strain", 0.0, False)]
     names = [term.name for term in Options(terms=terms).model_terms(visits=True)]
-    assert names == ["drift", "microscope", "plate_shape", "line_eccentricity", "rotation", "yaw"]
+    assert names == ["drift", "microscope", "plate_shape", "line_eccentricity", "line_scale",
+                     "rotation", "yaw"]
     assert [term.name for term in Options(terms=terms).model_terms(visits=False)] == [
-        "drift", "plate_shape", "line_eccentricity", "rotation", "yaw"]
+        "drift", "plate_shape", "line_eccentricity", "line_scale", "rotation", "yaw"]
     assert Options(terms=terms, assumed=()).model_terms(visits=True) == terms[:1]
 
 

@@ -267,7 +267,7 @@ def test_terms_of_a_plan_are_read_and_checked():
     for terms, message in (
             (["creep"], "here: model_terms: the term 'creep' is unknown; known are microscope, "
              "drift, plate_scale, plate_shape, approach, plate_strain, line_eccentricity, "
-             "rotation, yaw"),
+             "line_scale, rotation, yaw"),
             ([{"drift": 1e-9}], "here: model_terms: {'drift': 1e-09} is not a text; write TERM or "
              "TERM:SIZE"),
             ("drift", "here: model_terms: 'drift' is not of type list; write [drift]")):

@@ -62,8 +62,9 @@ class DenseFit:
                           len(self.keys)])
         self.g, self.a, self.gt, self.at, self.pose, self.b = (
             slice(*pair) for pair in pairwise(ends))
-        self.offset, self.p = self.seen, np.zeros(ends[-1])
-        magnified = any(term == "microscope" for term, *_ in self.keys)
+        self.offset, self.line_offset = self.seen, self.line_seen
+        self.p = np.zeros(ends[-1])
+        magnified = any(term in ("microscope", "line_scale") for term, *_ in self.keys)
         self.places = places
         self.steps = PLACE_STEPS if places else STEPS if magnified or rigid else 1
         for number in range(self.steps):
@@ -73,6 +74,7 @@ class DenseFit:
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)
             self.offset = self.seen - self.left
+            self.line_offset = self.line_seen - self.left_of_lines
 
     def _coefficients(self, terms, degree):
         """Names (term, view, component) and sizes of all coefficients; view -1: all views."""
@@ -83,6 +85,8 @@ class DenseFit:
         for term in terms:
             if term.name == "microscope":
                 mine = [(-1, part) for part in ("scale", "turn", "stretch", "shear")]
+            elif term.name == "line_scale":
+                mine = [(-1, "scale")] if lines else []
             elif term.name == "approach":
                 mine = [(-1, "x"), (-1, "y")]
             elif term.name == "drift":
@@ -140,6 +144,8 @@ class DenseFit:
         self.k = np.concatenate([view.k for _, view in views] or empty)
         self.line_view = np.concatenate([np.full(len(view.k), v) for v, view in views] or empty)
         self.line_y = np.concatenate([view.dtheta for _, view in views] or empty)
+        self.line_seen = np.concatenate([view.dtheta - view.axis_theta for _, view in views]
+                                        or empty)
         self.line_weight = np.concatenate([view.count_theta for _, view in views] or empty)
         turn = np.array([round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
                          for view in self.readings.views])
@@ -182,6 +188,8 @@ class DenseFit:
             if term in ("line_eccentricity", "rotation"):
                 wave = {"cos": np.cos, "sin": np.sin, "turn": np.ones_like}[part]
                 turned[row] = wave(2 * np.pi * self.k / self.K) * (self.line_view == v)
+            elif term == "line_scale":
+                turned[row] = -self.line_offset
             elif term in MARKS:
                 strained[row] = self._of_plate(part, term) * (self.view == v)
             else:
@@ -242,6 +250,7 @@ class DenseFit:
         self.p = self.p + self._solve[:, :len(known)] @ known
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
+        self.left_of_lines = left[2 * n:]
 
     def with_places_in_covariance(self):
         """Let the covariance be that of the equations of the sites for readings at the places."""

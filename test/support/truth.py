@@ -186,7 +186,7 @@ def _angular(readings: ViewReadings, truth: Truth, found: cell.AngularExposures,
     deviation, offset = (_read(sense, found) - nominal)[None, kept], found.offset[None, kept]
     (mean,), sigma, dof = _means(deviation, line, repeats)
     motion = repeat_motion(line, deviation - offset, offset, np.zeros(len(line), dtype=bool))
-    about = np.angle(np.exp(1j * (deviation - offset))).mean() if truth.artifact.harmonics else 0
+    about = np.angle(np.exp(1j * (deviation - offset))).mean()
     return replace(readings, axis_theta=float(about), k=lines, dtheta=mean, count_theta=repeats,
                    sigma_theta=sigma, dof_theta=dof, motion_theta=motion)
 

@@ -62,6 +62,8 @@ def _checked() -> list[Case]:
         _case("check stops: plate bowed by 5 um, optical axis tilted by 5 mrad", more=stops,
               plate_bow_m=5e-6, optical_tilt_x_rad=5e-3),
         _case("check stops: stage bends by 10 nm in each view", more=stops, stage_bend_m=10e-9),
+        _case("check stops: offsets of the lines of 0.9 times their size", more=stops,
+              line_factor=0.9),
         _case("check stops: drift of 0.36 um a view, one raster, repeats consecutive", more=stops,
               settings=replace(SERVO, consecutive=True, visit_order="raster"),
               drift_linear_m=0.36e-6)]
@@ -104,6 +106,8 @@ def _scaled() -> list[Case]:
                              (-0.01, 0.03))),
         _case("scale of the microscope +5 %, no lines", more={"plan": hu_plan(WITHOUT_LINES, 5)},
               microscope_scale=0.05),
+        *(_case(f"offsets of the lines of {factor:g} times their size", phi, line_factor=factor)
+          for factor, phi in ((0.9, 0.03), (0.97, 0.03), (1.02, 0.001))),
         _case("microscope turned by 5 mrad", 0.005, microscope_rotation_rad=5e-3),
         _case("microscope turned by 20 mrad", 0.03, microscope_rotation_rad=20e-3),
         _case("shear of the microscope 2 mrad", 0.1, microscope_shear=2e-3),

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from selfcal_ros.blocks import Block
+from selfcal_ros.blocks import Block, block_of
 from selfcal_ros.errors import NotSettledError
 from selfcal_ros.estimation.datum.covariance import TermSpread
 from selfcal_ros.estimation.joint.problem import (
@@ -78,6 +78,8 @@ class ModelFit:
     sizes : tuple of SizeTest
         The test of every size. In place of one that the readings contradict the fit, and with it
         every uncertainty, has the largest that they allow.
+    given : tuple of ModelTerm
+        The terms with the sizes that were given, if larger ones are used.
     """
 
     problem: Problem
@@ -86,6 +88,7 @@ class ModelFit:
     coefficients: np.ndarray
     y: np.ndarray
     sizes: tuple[SizeTest, ...] = ()
+    given: tuple[ModelTerm, ...] = ()
 
     @property
     def covariance(self) -> np.ndarray:
@@ -183,7 +186,7 @@ class _State:
         self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_offsets for term in problem.terms)
         if problem.terms:
-            ground = without_noise(problem.ground, self.found.residuals)
+            ground = without_noise(problem.ground, self.found.both_residuals)
             self._linearise(term_columns(ground, problem.terms))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
@@ -202,16 +205,22 @@ class _State:
 
     def _anew(self, before: TermColumns) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
-        ground = without_noise(self.moving.ground(self.found), self.found.residuals,
+        ground = without_noise(self.moving.ground(self.found), self.found.both_residuals,
                                before.at_visits(self.coefficients))
         columns = term_columns(ground, self.problem.terms)
-        rows = columns.having(lambda block: block.of_offsets)
-        effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
-            self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
-        if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
+        if self.of_offsets and self._of_offsets(columns, before) <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
+
+    def _of_offsets(self, columns: TermColumns, before: TermColumns) -> float:
+        """Return by how much the effect of measured offsets differs at most from before, m."""
+        rows = columns.having(lambda block: block.of_offsets)
+        marks = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
+            self.coefficients, rows)
+        lines = columns.lines.effect(self.coefficients) - before.lines.effect(self.coefficients)
+        return max(float(np.abs(marks).max()),
+                   self.problem.half_width_m * float(np.abs(lines).max(initial=0.0)))
 
     def _stale(self, equations: TermEquations) -> bool:
         """Return whether the weights of angular readings differ from those in the equations."""
@@ -286,8 +295,9 @@ class _State:
                                               inverse=inverse)
         lines = equations.columns.lines
         if len(lines.at):
-            taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
-            own = equations.columns.having(lambda block: block.of_lines and not block.between)
+            taken = lines.effect(self.coefficients)
+            own = equations.columns.having(
+                lambda block: block.of_lines and not block.turns_lines)
             within = inverse[np.ix_(own, own)]
             dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
             angular = replace(self.problem.angular, y=self.lines_read - taken)
@@ -467,7 +477,8 @@ def fit_model(problem: Problem,
     it doubtful, the fit is repeated with the largest size that they allow. A term that all views
     share, or a turn of lines, comes first if it explains all by itself: marks that turn against
     lines as a microscope of another scale turns them are not plates that moved between both, nor
-    bent ones.
+    bent ones. If several that all views share do, as the scales of the offsets of marks and lines,
+    each is repeated so.
 
     Parameters
     ----------
@@ -485,23 +496,51 @@ def fit_model(problem: Problem,
     sizes = _size_tests(model, problem.terms)
     if not any(test.raised for test in sizes):
         return replace(model, sizes=sizes)
-    for term in problem.terms:
+    explained = list(_explained_by_one(model, check))
+    alike = [alone for term, alone, _ in explained if term.block.shared]
+    if len(alike) > 1:
+        alone = tuple(test for tests in alike for test in tests)
+        rest = _rest_of_tests(problem, alone, check)
+        sizes = (*alone, *rest)
+    elif explained:
+        _, alone, rest = explained[0]
+        sizes = (*alone, *rest)
+    return replace(settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms)
+
+
+def _explained_by_one(model: ModelFit, check: Callable[[TermEquations], None]
+                      ) -> Iterator[tuple[ModelTerm, tuple[SizeTest, ...], tuple[SizeTest, ...]]]:
+    """Yield the terms with which alone nothing is contradicted, their tests and those of others."""
+    terms = model.problem.terms
+    for term in terms:
         first = term.block.shared or term.block.between
         alone = _size_tests(model, [term] if first else [])
         if any(test.contradicted for test in alone):
-            simpler = settled(_raised(problem, alone), check)
-            rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
+            rest = _rest_of_tests(model.problem, alone, check)
             if not any(test.contradicted for test in rest):
-                sizes = (*alone, *rest)
-                break
-    return replace(settled(_raised(problem, sizes), check), sizes=sizes)
+                yield term, alone, rest
+
+
+def _rest_of_tests(problem: Problem, raised: Sequence[SizeTest],
+                   check: Callable[[TermEquations], None]) -> tuple[SizeTest, ...]:
+    """Return the tests of the other sizes if those of some terms are what the readings allow."""
+    simpler = settled(_raised(problem, raised), check)
+    names = {test.name for test in raised}
+    return _size_tests(simpler, [term for term in problem.terms if term.name not in names])
 
 
 def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
-    """Return the problem with the sizes that the readings allow where they make them doubtful."""
-    allowed = {test.name: test.allowed for test in sizes if test.raised}
+    """Return the problem with the sizes that the readings allow where they make them doubtful.
+
+    Lines and marks turn alike as far as the scales of their offsets are alike: where the size of
+    one is doubtful, that of the other is, too.
+    """
+    larger = {test.name: test.allowed / test.given for test in sizes if test.raised}
+    offsets = max((factor for name, factor in larger.items() if block_of(name).of_offsets),
+                  default=1.0)
     return replace(problem, terms=tuple(
-        term.scaled(allowed[term.name] / term.size) if term.name in allowed else term
+        term if term.free else term.scaled(max(
+            larger.get(term.name, 1.0), offsets if term.block.of_offsets else 1.0))
         for term in problem.terms))
 
 

@@ -474,7 +474,7 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
         return ()
     columns, covariance = model.equations.columns.columns, model.covariance
     told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
-    given = {test.name: test.given for test in model.sizes if test.raised}
+    given = {term.name: term.size for term in model.given}
     out = []
     for term in model.problem.terms:
         estimates = tuple(
@@ -484,8 +484,9 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
                          if told[i] else float("nan"), c.unit)
             for i, c in enumerate(columns) if c.term == term.name)
         size = None if term.free else term.size
-        out.append(TermResult(str(term.name), given.get(term.name, size), estimates,
-                              size if term.name in given else None,
+        before = None if term.free else given.get(term.name, term.size)
+        out.append(TermResult(str(term.name), before, estimates,
+                              size if size != before else None,
                               "declared" if term.name in declared else "default"))
     return tuple(out)
 

@@ -115,7 +115,7 @@ class KnownPlate:
     def of_offsets(self) -> np.ndarray:
         """Coefficients of the microscope that it found, (4,); NaN if it did not estimate them."""
         found = {each.component: each.value for term in self.result.model.terms
-                 if block_of(term.name).of_offsets for each in term.estimates}
+                 if block_of(term.name).of_microscope for each in term.estimates}
         return np.array([found.get(part, 0.0 if found else np.nan) for part in MICROSCOPE_PARTS])
 
 

@@ -233,7 +233,7 @@ def _findings(found: Recheck) -> tuple[Finding, ...]:
 
 def _off(solved: Rechecked) -> tuple[Finding, ...]:
     """Return a finding if visits show another microscope than is assumed."""
-    term = next((term for term in solved.readings.problem.terms if term.block.of_offsets), None)
+    term = next((term for term in solved.readings.problem.terms if term.block.of_microscope), None)
     if solved.microscope is None or term is None:
         return ()
     values = solved.microscope.values
@@ -309,9 +309,9 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
         (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0))
     columns = _columns(problem, of_mark, of_stop)
-    offsets, declared = plate.of_offsets, any(term.block.of_offsets for term in options.terms)
-    of_offsets = columns.having(lambda block: block.of_offsets)
-    known = of_offsets & (np.isfinite(offsets).all() and not declared and seen is None)
+    offsets, declared = plate.of_offsets, any(term.block.of_microscope for term in options.terms)
+    of_microscope = columns.having(lambda block: block.of_microscope)
+    known = of_microscope & (np.isfinite(offsets).all() and not declared and seen is None)
     parts = np.array([MICROSCOPE_PARTS.index(columns.columns[at].component)
                       for at in np.flatnonzero(known)], dtype=int)
     source = np.where(columns.rows([PLATE]) | known, PLATE,
@@ -322,7 +322,7 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     effects = Effects.of(source, columns.size, np.concatenate([now.real, now.imag, offsets[parts]]),
                          before=before, length=plate.length_at(marks)[kept[start:] - start])
     if seen is not None:
-        effects = effects.known_as(of_offsets, seen.covariance)
+        effects = effects.known_as(of_microscope, seen.covariance)
     return PlateReadings(problem, measurements.sense, columns, effects, variance,
                          shows_microscope=seen is not None)
 
@@ -374,7 +374,7 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
     made.add_terms(problem.terms)
     columns = made.done()
-    of_offsets, within = columns.having(lambda block: block.of_offsets), columns.within
+    of_offsets, within = columns.having(lambda block: block.of_microscope), columns.within
     if not of_offsets.any() or not within.dof:
         return None
     free = np.array([column.component in SIMILAR for column in columns.columns]) & of_offsets
@@ -414,7 +414,8 @@ def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> Term
 
     The latter for offsets as they were seen.
     """
-    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
+    made = ColumnBuilder(without_noise(
+        problem.ground, (np.zeros(problem.grid.y.shape), np.zeros(problem.angular.y.shape))))
     for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
         numbers = [made.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
         for axis, unit in AXES:

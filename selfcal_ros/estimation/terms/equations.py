@@ -194,8 +194,8 @@ def lines_eliminated(angular: AngularSystem,
 
 
 OVER_NOISE = 100.0
-"""Ratio of the variance of the offsets to that of their noise from which they determine a
-microscope: below, they would be dominated by their own noise, which is in the readings as well."""
+"""Ratio of the variance of the offsets to that of their noise from which they determine the scale
+of offsets: below, they would be dominated by their own noise, which is in the readings as well."""
 
 FREE = ""
 """Name of the part of a covariance that all free terms have together."""
@@ -284,19 +284,19 @@ class TermEquations:
 
     def limit(self, rows: np.ndarray) -> float:
         """Return the eigenvalue of the scaled equations of `rows` that counts as zero."""
-        seen = self._norm_of_microscope[rows]
-        least = float(seen.min()) if len(seen) else np.inf
-        # each column contains the noise of one coordinate of every mean
-        return max(GAP, OVER_NOISE * self._power / least**2)
+        return max(GAP, OVER_NOISE * float(self._noise_of_offsets[rows].max(initial=0.0)))
 
     @cached_property
-    def _norm_of_microscope(self) -> np.ndarray:
-        """The norm of the microscope's columns, infinite for others, (p,)."""
-        return np.where(self.columns.having(lambda block: block.of_offsets), self.norm, np.inf)
+    def _noise_of_offsets(self) -> np.ndarray:
+        """The part of the weighted square of every column that the noise of offsets makes, (p,).
 
-    @cached_property
-    def _power(self) -> float:
-        return self.noise_m**2 * self.system.grid.n_readings
+        Columns of marks hold the noise of one coordinate of every mean; those of lines, whose
+        residuals leave no more of it, that of the rotation of every view.
+        """
+        marks = self.columns.having(lambda block: block.of_microscope)
+        lines = self.columns.having(lambda block: block.of_offsets and block.of_lines)
+        values = self.system.grid.n_readings * marks + self.system.angular.n_views * lines
+        return values * (self.noise_m / self.norm) ** 2
 
     @cached_property
     def maps(self) -> np.ndarray:
@@ -349,7 +349,7 @@ class TermEquations:
         """
         count = 2 * self.system.grid.n_readings + self.columns.within.dof
         # those that multiply an offset along its own axis: 1, not i, in the direction of the noise
-        feigned = self.columns.having(lambda block: block.of_offsets) & (
+        feigned = self.columns.having(lambda block: block.of_microscope) & (
             self.columns.shapes.unit == 1)
         return (self.noise_m * count) ** 2 * feigned
 
@@ -606,7 +606,7 @@ class SizeTest:
     shown, allowed : float
         The size shown by the readings, and the largest that they allow: the upper one of two limits
         with a coverage of 95.45 % if they contradict the given size; the limit of `DOUBT_LEVEL` if
-        they make it doubtful, beyond what is plausible no more than `shown`; otherwise the given
+        they make it doubtful; beyond what is plausible no more than `shown`; otherwise the given
         size.
     statistic : float
         b' (C + size^2 1)^-1 b of all coefficients; `rank` on average.
@@ -704,8 +704,8 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
 
     tail = TAIL if test.contradicted else DOUBT_LEVEL
     shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
-    if not test.contradicted:  # the limit of few coefficients is far above what they show
-        allowed = min(allowed, max(term.size, term.block.plausible, shown))
+    # the limit of few coefficients is far above what they show
+    allowed = min(allowed, max(term.size, term.block.plausible, shown))
     wider = float(np.log(variances(shown) / variances(term.size)).sum())
     return replace(test, shown=shown, allowed=allowed,
                    evidence=float(found - statistic(shown) - wider) / 2)

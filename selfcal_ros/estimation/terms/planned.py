@@ -63,6 +63,8 @@ class Assumed:
     error_m : float
         Standard deviation of the errors of stage and plate, each and per axis, m. They are offsets
         of marks at which a stage stops exactly on its targets.
+    error_rad : float
+        Standard deviation of the errors of rotary encoder and lines, each, rad.
     """
 
     sigma_m: float = 20e-9
@@ -73,6 +75,7 @@ class Assumed:
     turn_rad: float = math.radians(0.3)
     away_m: float = 30e-6
     error_m: float = 1e-6
+    error_rad: float = 10e-6
 
 
 def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEquations,
@@ -97,7 +100,7 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     grid_views = [views[i] for i in system.grid_index]
     placings = placings_of(grid_views)
     number = np.unique(placings, return_inverse=True)[1]  # the cells of an image see one plate
-    placed = np.array([ndtri((first + step * number) % 1) for first, step in SPREAD]).T
+    placed = np.array([_placed(number, *spread) for spread in SPREAD]).T
     visits = tuple(_visits(artifact, view, assumed, rng, (row, errors))
                    for row, view in zip(placed, grid_views, strict=True))
     lines = [views[i] for i in system.angular_index]
@@ -105,11 +108,34 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
     return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.reach),
                   system.grid.weight, visits, tuple(view.name for view in grid_views),
                   line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
+                  line_offsets=_line_offsets(system, assumed, number),
                   with_lines=shared if len(shared) > 1 else (), placings=placings,
                   placing_names=tuple(view.plan_view for view in grid_views),
                   cells_m=np.array([view.cell_m for view in grid_views]), stage=artifact.field,
                   drift_degree=assumed.drift_degree,
                   poses=tuple(view.pose for view in grid_views))
+
+
+def _placed(number: np.ndarray, first: float, step: float) -> np.ndarray:
+    """Return rotations or positions of placings, in standard deviations."""
+    return ndtri((first + step * number) % 1)
+
+
+def _line_offsets(system: NormalEquations, assumed: Assumed, number: np.ndarray) -> np.ndarray:
+    """Return the offsets of lines at which the stage stops at their nominal angles, rad.
+
+    (views of lines, lines), given the placings of the views of marks; views of lines alone are
+    placings after those.
+    """
+    of_view = dict(zip(system.grid_index, number, strict=True))
+    last = int(number.max(initial=-1))
+    alone = (index for index in system.angular_index if index not in of_view)
+    of_view |= {index: last + 1 + at for at, index in enumerate(alone)}
+    placings = np.array([of_view[index] for index in system.angular_index], dtype=int)
+    turn = assumed.turn_rad * _placed(placings, *SPREAD[0])
+    stage, plate = assumed.error_rad * np.random.default_rng([1, 2]).normal(
+        size=(2, system.angular.n_lines))
+    return system.angular.gather(stage) + plate + turn[:, None]
 
 
 def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,

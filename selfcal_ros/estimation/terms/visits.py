@@ -227,6 +227,8 @@ class TermInputs:
         Names of the views in which lines were read.
     n_lines : int
         Lines of the plate, K.
+    line_offsets : float array (views of lines, lines)
+        Offset measured at each line, rad; 0 where not read.
     with_lines : tuple of int
         Which of these views are views of marks as well, if there are two or more: their marks and
         lines share rotations.
@@ -254,6 +256,7 @@ class TermInputs:
     sense: Sense = Sense.MICROSCOPE_MOVES
     line_names: tuple[str, ...] = ()
     n_lines: int = 0
+    line_offsets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     with_lines: tuple[int, ...] = ()
     placings: tuple[int, ...] = ()
     placing_names: tuple[str, ...] = ()
@@ -348,13 +351,26 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
     return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
                       measurements.sense,
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
+                      line_offsets_of(lines, measurements.artifact.angular_count),
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
                       np.array([view.cell_m for view in views]), measurements.artifact.field,
                       drift_degree, tuple(view.pose for view in views))
 
 
-def without_noise(ground: TermInputs, residuals: np.ndarray,
+def line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
+    """Return the offset measured at each line, (views, lines), rad; 0 where not read.
+
+    The stage stood at the nominal angle of each line up to what is the same for all of a view:
+    deviations are offsets but for that.
+    """
+    out = np.zeros((len(views), n_lines))
+    for row, view in zip(out, views, strict=True):
+        row[view.k] = view.dtheta - view.axis_theta
+    return out
+
+
+def without_noise(ground: TermInputs, residuals: tuple[np.ndarray, np.ndarray],
                   of_terms: Sequence[np.ndarray | float] = ()) -> TermInputs:
     """Return the ground with offsets from which the noise of the readings is taken off.
 
@@ -366,17 +382,18 @@ def without_noise(ground: TermInputs, residuals: np.ndarray,
     ----------
     ground : TermInputs
         With the offsets as they were seen.
-    residuals : complex array (views, nx, ny)
-        Residuals of the means of the marks, plate frame, m.
+    residuals : complex array (views, nx, ny), float array (views, lines)
+        Residuals of the means of the marks, plate frame, m, and of the lines, rad.
     of_terms : sequence, optional
         What terms make of each visit of each view, (V,), plate frame, m; none without terms.
     """
     visits = []
     terms = of_terms or [0.0] * len(ground.visits)
-    for view, residual, known in zip(ground.visits, residuals, terms, strict=True):
+    of_marks, of_lines = residuals
+    for view, residual, known in zip(ground.visits, of_marks, terms, strict=True):
         if view is not None:
             rest = view.about_means((view.y - known)[None], residual.size)[0]
             rest = rest + residual.reshape(-1)[view.mark]
             view = replace(view, offset=view.offset - rest * np.conj(view.phase))
         visits.append(view)
-    return replace(ground, visits=tuple(visits))
+    return replace(ground, visits=tuple(visits), line_offsets=ground.line_offsets - of_lines)

@@ -217,7 +217,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     if model is None or model.equations is None:
         return []
     equations = model.equations
-    rows = equations.columns.having(lambda block: block.of_offsets)
+    rows = equations.columns.having(lambda block: block.of_microscope)
     scale = [at for at in np.flatnonzero(rows)
              if equations.columns.columns[at].component == "scale"]
     if not scale or not np.isfinite(model.found.xy.sigma):
@@ -230,7 +230,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
 def _is_declared(options: Options) -> bool:
     """Return whether the microscope is declared, and with it the signs of the offsets."""
     return not options.assumed or any(
-        term.block.of_offsets and not term.free for term in options.terms)
+        term.block.of_microscope and not term.free for term in options.terms)
 
 
 def _lines_sign_findings(solved: Solved, measurements: Measurements,
@@ -268,13 +268,13 @@ def _scale_findings(solved: Solved, measurements: Measurements, options: Options
     reduces the scale and that of detections increases it: they give limits.
     """
     term = next((term for term in options.model_terms(visits=True)
-                 if term.block.of_offsets), None)
+                 if term.block.of_microscope), None)
     u = 0.0 if term is None else term.size_of("scale")
     fitted = [estimate for each in solved.result.model.terms
               if term is not None and each.name == term.name for estimate in each.estimates
               if estimate.component == "scale" and estimate.u < TOLD * u]
     if np.isinf(u) or fitted or any(
-            cause.name in blocks() and blocks()[cause.name].of_offsets for cause in causes):
+            cause.name in blocks() and blocks()[cause.name].of_microscope for cause in causes):
         return []
     found = contradicted_scale(measurements, u)
     return [] if found is None else [Finding(

@@ -105,11 +105,14 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     solved, tests = found.solved, found.solved.joint.sizes
     raised = {str(test.name): _raised_cause(solved, test) for test in tests
               if (test.contradicted or not _is_plausible(test)) and test.name not in found.terms}
+    scales = _either_scale(solved, measurements, options) if any(
+        block_of(name).of_offsets for name, cause in raised.items() if cause) else {}
+    raised = scales | {name: cause for name, cause in raised.items() if name not in scales}
     names = [name for name, cause in raised.items() if cause is not None]
     found.bounded &= not any(_beyond_u(solved, test) for test in tests)
     plausible = all(map(_is_plausible, tests))
     between = any(block_of(name).between for name in raised)
-    alike = between and _as_a_microscope(found, measurements, options)
+    alike = bool(scales) or (between and _as_a_microscope(found, measurements, options))
     found.causes[:0] = [cause for cause in raised.values() if cause is not None]
     turned = turned_too_far(solved.joint, solved.result, measurements)
     if turned is not None:
@@ -328,9 +331,10 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
                    whole=little or test.rank == len(term.estimates))
     if not _counts(held, solved) and _is_plausible(test):
         return None
-    if block_of(test.name).between and abs(
+    block = block_of(test.name)
+    if (block.between or block.shared) and abs(
             (cause := cause_of(held, solved.joint.problem.ground)).size) > BEYOND * cause.u:
-        return cause  # otherwise the readings do not determine which view it is
+        return cause  # otherwise the readings do not determine which view or part it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
     return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
                  largest.view, details={"given": test.given})
@@ -353,13 +357,9 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
     """
     known = next((term for term in options.model_terms(visits=True)
-                  if term.block.of_offsets and not term.free), None)
-    if known is None:
-        return False
-    # so wide that it need not share with a doubtful rotation what it explains by itself
-    wider = known.scaled(max(BEYOND * known.block.plausible / known.size, 1.0))
-    twin = solved_with(measurements, options, [wider])
-    if twin is None or any(test.contradicted for test in twin.joint.sizes):
+                  if term.block.of_microscope and not term.free), None)
+    twin = known and _with_wide(known, measurements, options)
+    if known is None or twin is None:
         return False
     held = fitted_term(twin.joint, known.name)
     effect = difference(str(known.name), twin.result, found.solved.result)
@@ -398,3 +398,31 @@ def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
         more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)
         found.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
     found.causes += sorted(noisy, key=lambda cause: cause.p)
+
+
+def _with_wide(known: ModelTerm, measurements: Measurements, options: Options) -> Solved | None:
+    """Return the solution with a term so wide that it need not share what it explains by itself.
+
+    None if there is none, or the readings contradict another size.
+    """
+    wider = known.scaled(max(BEYOND * known.block.plausible / known.size, 1.0))
+    twin = solved_with(measurements, options, [wider])
+    contradicted = twin is None or any(test.contradicted for test in twin.joint.sizes)
+    return None if contradicted else twin
+
+
+def _either_scale(solved: Solved, measurements: Measurements,
+                  options: Options) -> dict[str, Cause | None]:
+    """Return the scales of the offsets of marks and of lines as causes, each as the only one.
+
+    Nothing if not each by itself explains what the readings show.
+    """
+    causes: dict[str, Cause | None] = {}
+    for term in solved.joint.given:
+        if term.block.of_offsets and not term.free:
+            twin = _with_wide(term, measurements, options)
+            if twin is None:
+                return {}
+            cause = cause_of(fitted_term(twin.joint, term.name), twin.joint.problem.ground)
+            causes[str(term.name)] = replace(cause, details=cause.details | {"either": True})
+    return causes if len(causes) > 1 else {}

@@ -48,7 +48,7 @@ def unit_of(name: str, si: str) -> DisplayUnit:
     Small angles of axes and lines are in µrad, rotations of plate and microscope in mrad.
     """
     block = blocks().get(name)
-    if block is not None and (block.of_lines or block.of_images):
+    if si == "rad" and block is not None and (block.of_lines or block.of_images):
         return URAD
     return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, DisplayUnit(1.0, si))
 
@@ -103,7 +103,9 @@ Words = Callable[[Any, dict[str, Any]], str]
 """A finding and its details -> its sentence."""
 
 _CAUSES: dict[str, Words] = {
-    "microscope": lambda c, of: _MICROSCOPE[of["part"]](c),
+    "microscope": lambda c, of: _MICROSCOPE[of["part"]](c) + (
+        f", or offsets of the lines too {_either(c, 'large', 'small')} by as much"
+        if of.get("either") else ""),
     "drift": lambda c, of: (
         f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'"),
     "plate_scale": lambda c, of: (
@@ -119,6 +121,10 @@ _CAUSES: dict[str, Words] = {
     "line_eccentricity": lambda c, of: (
         f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
         f"view '{c.view}'"),
+    "line_scale": lambda c, of: (
+        f"offsets of the lines too {_either(c, 'small', 'large')} by {plus_minus(c, PERCENT)}" + (
+            f", or a microscope that shows lengths too {_either(c, 'long', 'short')} by as much"
+            if of.get("either") else "")),
     "yaw": lambda c, of: f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel",
     "approach": lambda c, of: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
@@ -151,6 +157,7 @@ _ACTIONS = {
     "plate_shape": "support the plate without strain",
     "plate_strain": "support the plate without strain",
     "line_eccentricity": "centre the circle of lines on the axis of rotation in each view",
+    "line_scale": "compare the offset of a line at two angles of the rotary axis",
     "yaw": "declare a larger yaw:SIZE",
     "approach": "approach each mark from the same side",
     "slip": "measure the view again, or solve with --robust",
@@ -407,6 +414,7 @@ _ASSUMED = {
     "plate_strain": "a plate strained by {} from view to view",
     "approach": "an indicated position that changes by {} with the direction of approach",
     "line_eccentricity": "a circle of lines {} of its radius off the axis",
+    "line_scale": "offsets of the lines known to {}",
     "rotation": "lines that turn by {} against the marks from view to view",
     "yaw": "a stage that yaws by {}"}
 """What is assumed of a term, given its size."""
@@ -427,7 +435,7 @@ def assumption_text(result: CalibrationResult) -> str:
 
 def _assumed(line: BudgetLine) -> str:
     name = line.component.removeprefix(TERM)
-    unit = PERCENT if name == "microscope" else unit_of(name, line.unit)
+    unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, line.unit)
     given = line.details.get("given")  # a file may have lost it
     size_si = given if isinstance(given, float) else line.u
     size = f"{size_si * unit.per_si:.3g} {unit.name} (k=1)"

@@ -103,6 +103,7 @@ _CERTIFICATES: dict[str, str] = {
     "microscope": "declare the microscope (--microscope), from a certificate of its scale",
     "plate_strain": "declare a smaller plate_strain:SIZE, from support and temperature",
     "line_eccentricity": "declare a smaller line_eccentricity:SIZE, from a certificate",
+    "line_scale": "declare a smaller line_scale:SIZE, from a certificate",
     "yaw": "declare a smaller yaw:SIZE, from a measurement of the stage's angles"}
 """What removes a line of a plan's budget that no change of the plan removes."""
 

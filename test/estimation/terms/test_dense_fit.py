@@ -27,19 +27,21 @@ MODELS = {
     "none": "",
     "assumed": ",".join(map(str, default_terms())),
     "sized": "microscope:0.01:0.02:0.001,drift:5e-8,plate_scale:3e-7,plate_shape:2e-8,"
-             "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6,rotation:1e-6",
+             "approach:3e-8,plate_strain:2e-7,line_eccentricity:3e-6,"
+             "line_scale:0.01,rotation:1e-6",
     "free": "microscope,drift,plate_scale,approach,rotation",
-    "mixed": "microscope:0:0.01:0.002,drift,plate_scale:1e-7,approach,line_eccentricity:2e-6"}
+    "mixed": "microscope:0:0.01:0.002,drift,plate_scale:1e-7,approach,line_eccentricity:2e-6,"
+             "line_scale:0.02"}
 MACHINE = Spread(
     microscope_rotation_rad=4e-3, microscope_scale=-5e-3,
     microscope_shear=5e-4, microscope_stretch=3e-4, backlash_x_m=20e-9, backlash_y_m=-15e-9,
     plate_scale=3e-7, plate_shape_m=4e-9, plate_strain=1e-7, line_eccentricity_rad=3e-6,
-    drift_linear_m=40e-9, drift_quadratic_m=30e-9)
+    line_factor=1.008, drift_linear_m=40e-9, drift_quadratic_m=30e-9)
 PARTS = {"microscope": ("microscope_rotation_rad", "microscope_scale", "microscope_shear",
                         "microscope_stretch"), "approach": ("backlash_x_m", "backlash_y_m"),
          "plate_scale": ("plate_scale",), "plate_shape": ("plate_shape_m",),
          "plate_strain": ("plate_strain",), "line_eccentricity": ("line_eccentricity_rad",),
-         "drift": ("drift_linear_m", "drift_quadratic_m")}
+         "line_scale": ("line_factor",), "drift": ("drift_linear_m", "drift_quadratic_m")}
 
 
 def views(*poses, lines, repeats, order):
@@ -72,7 +74,8 @@ def measured(plan, model, sense=Sense.MICROSCOPE_MOVES, missing=0.0, rotation="l
     """Readings of a machine that has what the model holds, and no more."""
     plan, rng = PLANS[plan], np.random.default_rng(3)
     held = {term.name for term in parse_terms([MODELS[model]], "")}
-    spread = replace(MACHINE, rotation=rotation, **{part: 0.0 for name, parts in PARTS.items()
+    spread = replace(MACHINE, rotation=rotation, **{part: getattr(Spread(), part)
+                                                    for name, parts in PARTS.items()
                                                     if name not in held for part in parts})
     truth = random_truth(plan.artifact, len(plan.views), rng, spread)
     return simulate_measurements(truth, plan, rng, missing=missing, visits=True,

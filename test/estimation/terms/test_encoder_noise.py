@@ -53,5 +53,5 @@ def test_to_measure_again_is_no_remedy_for_the_wrong_unit():
     _, readings = measured(NOISE, offsets_m=NOISE, phi_rad=5e-5, microscope_pixels=0.5)
     verdict = calibrate(readings).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
-    assert "rotation" in [cause.name for cause in verdict.causes]
+    assert "microscope" in [cause.name for cause in verdict.causes]
     assert all(remedy.kind != "view" for cause in verdict.causes for remedy in cause.remedies)

@@ -119,7 +119,20 @@ def test_a_cause_in_words(found, text, size, u, unit):
 
 
 TURN = Cause("microscope", 2e-3, 1e-5, "rad", 1e-6, details={"part": "turn"})
+SCALE = Cause("microscope", 0.06, 1e-3, "m/m", 1e-6, details={"part": "scale", "either": True})
+COMPARE = "compare the offset of a line at two angles of the rotary axis"
 CAUSES = [
+    *((Cause("line_scale", size, 1e-3, "m/m", 1e-6, details={"part": "scale"}),
+       f"offsets of the lines too {how} by 5.00 ± 0.10 %: {COMPARE}")
+      for size, how in ((0.05, "small"), (-0.05, "large"))),
+    *((replace(SCALE, name="line_scale", size=size),
+       f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a microscope that shows lengths too "
+       f"{other} by as much: {COMPARE}")
+      for size, how, other in ((0.06, "small", "long"), (-0.06, "large", "short"))),
+    *((replace(SCALE, size=size),
+       f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, or offsets of the lines too "
+       f"{other} by as much: {ALIGN}")
+      for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))),
     (Cause("reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)),
      "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 arcsec: solve with --robust, or "
      "measure it again"),
@@ -372,6 +385,7 @@ def test_a_result_is_worded_once_and_only_then_written():
 
 @pytest.mark.parametrize(("name", "si", "unit"), [
     ("drift", "m", "µm"), ("microscope", "m/m", "µm/m"), ("microscope", "rad", "mrad"),
-    ("line_eccentricity", "rad", "µrad"), ("plate_strain", "m/m", "µm/m")])
+    ("line_eccentricity", "rad", "µrad"), ("line_scale", "m/m", "µm/m"),
+    ("plate_strain", "m/m", "µm/m")])
 def test_estimates_and_causes_have_one_unit_each(name, si, unit):
     assert unit_of(name, si).name == unit
