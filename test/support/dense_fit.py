@@ -62,7 +62,7 @@ class DenseFit:
                           len(self.keys)])
         self.g, self.a, self.gt, self.at, self.pose, self.b = (
             slice(*pair) for pair in pairwise(ends))
-        self.offset, self.line_offset = self.seen, self.line_seen
+        self.offset, self.line_offset = self.seen, self.line_seen - self._left_by_lines()
         self.p = np.zeros(ends[-1])
         magnified = any(term in ("microscope", "line_scale") for term, *_ in self.keys)
         self.places = places
@@ -74,7 +74,6 @@ class DenseFit:
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)
             self.offset = self.seen - self.left
-            self.line_offset = self.line_seen - self.left_of_lines
 
     def _coefficients(self, terms, degree):
         """Names (term, view, component) and sizes of all coefficients; view -1: all views."""
@@ -150,6 +149,15 @@ class DenseFit:
         turn = np.array([round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
                          for view in self.readings.views])
         self.line_site = self.sign * (self.k + turn[self.line_view]) % max(self.K, 1)
+
+    def _left_by_lines(self):
+        """What lines leave if their views turn as they like."""
+        every = np.eye(self.K)
+        turns = np.eye(len(self.readings.views))[self.line_view]
+        columns = np.concatenate([self.sign * every[self.line_site], every[self.k], turns], axis=1)
+        weight = np.sqrt(self.line_weight)
+        found = np.linalg.lstsq(weight[:, None] * columns, weight * self.line_y, rcond=None)[0]
+        return self.line_y - columns @ found
 
     def _of_stage(self, g):
         """The stage error at every visit: where the stage truly stood, or at the site."""
@@ -250,7 +258,6 @@ class DenseFit:
         self.p = self.p + self._solve[:, :len(known)] @ known
         left, n = self._values - self._predicted(self.p), len(self.y)
         self.left = left[:n] + 1j * left[n:2 * n]
-        self.left_of_lines = left[2 * n:]
 
     def with_places_in_covariance(self):
         """Let the covariance be that of the equations of the sites for readings at the places."""

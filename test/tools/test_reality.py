@@ -169,8 +169,8 @@ def test_readings_of_a_bag_are_those_of_the_cell_and_say_what_is_wrong():
 def test_advice_is_followed_until_none_is_left():
     scaled_up = replace(next(
         case for case in every_case()
-        if case.name == "scale of the microscope +5 %, plates turned by 0.05 deg"),
-        plan=resistant(2))
+        if case.name == "check stops: scale of the microscope +5 %, plates turned by 0.05 deg"),
+        plan=checked(resistant(2)))
     course = run_case(scaled_up, 0)
     assert course.first.grade == "enlarged" and course.first.causes[0] == "microscope"
     (step,) = course.steps

@@ -184,9 +184,9 @@ class _State:
         self.offset_steps = LATE
         self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
         self.equations: TermEquations | None = None
-        self.of_offsets = any(term.block.of_offsets for term in problem.terms)
+        self.of_offsets = any(term.block.of_microscope for term in problem.terms)
         if problem.terms:
-            ground = without_noise(problem.ground, self.found.both_residuals)
+            ground = without_noise(problem.ground, self.found.residuals)
             self._linearise(term_columns(ground, problem.terms))
         equations = self.equations
         self.coefficients = np.zeros(equations.n if equations else 0)
@@ -205,22 +205,16 @@ class _State:
 
     def _anew(self, before: TermColumns) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
-        ground = without_noise(self.moving.ground(self.found), self.found.both_residuals,
+        ground = without_noise(self.moving.ground(self.found), self.found.residuals,
                                before.at_visits(self.coefficients))
         columns = term_columns(ground, self.problem.terms)
+        rows = columns.having(lambda block: block.of_microscope)
+        effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
+            self.coefficients, rows)
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
-        if self.of_offsets and self._of_offsets(columns, before) <= ROUNDED * largest:
+        if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
-
-    def _of_offsets(self, columns: TermColumns, before: TermColumns) -> float:
-        """Return by how much the effect of measured offsets differs at most from before, m."""
-        rows = columns.having(lambda block: block.of_offsets)
-        marks = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
-            self.coefficients, rows)
-        lines = columns.lines.effect(self.coefficients) - before.lines.effect(self.coefficients)
-        return max(float(np.abs(marks).max()),
-                   self.problem.half_width_m * float(np.abs(lines).max(initial=0.0)))
 
     def _stale(self, equations: TermEquations) -> bool:
         """Return whether the weights of angular readings differ from those in the equations."""
@@ -295,7 +289,7 @@ class _State:
                                               inverse=inverse)
         lines = equations.columns.lines
         if len(lines.at):
-            taken = lines.effect(self.coefficients)
+            taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
             own = equations.columns.having(
                 lambda block: block.of_lines and not block.turns_lines)
             within = inverse[np.ix_(own, own)]

@@ -46,6 +46,7 @@ from selfcal_ros.estimation.normal.equations import (
     MAX_NODES,
     UNASKED_SITES,
     NormalEquations,
+    angular_residuals,
     system_of,
 )
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
@@ -361,6 +362,9 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
                                    "undetermined)", seen)
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
+    # as a column, offsets would explain the noise that they hold
+    ground = replace(ground, line_offsets=ground.line_offsets - angular_residuals(
+        system, angular.y))
     terms = tuple(
         term for term in options.model_terms(
             visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations)

@@ -414,8 +414,7 @@ def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> Term
 
     The latter for offsets as they were seen.
     """
-    made = ColumnBuilder(without_noise(
-        problem.ground, (np.zeros(problem.grid.y.shape), np.zeros(problem.angular.y.shape))))
+    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
     for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
         numbers = [made.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
         for axis, unit in AXES:

@@ -116,10 +116,6 @@ class LineColumns:
     at: np.ndarray
     values: np.ndarray
 
-    def effect(self, coefficients: np.ndarray) -> np.ndarray:
-        """Return the sum of coefficients (p,) times columns, (views, K), rad."""
-        return np.tensordot(coefficients[self.at], self.values, axes=1)
-
     def sums(self, weighted: np.ndarray, power: int = 1) -> np.ndarray:
         """Return the sums of values, to a power, times `weighted` (views, K), (q,)."""
         return np.array([(value**power * weighted).sum() for value in self.values], dtype=float)

@@ -254,13 +254,14 @@ class TermEquations:
         """Coefficients to be determined by the readings alone, bool (p,)."""
         return np.isinf(self.columns.size)
 
-    def untold(self, rows: np.ndarray, limit: float | None = None) -> np.ndarray:
+    def untold(self, rows: np.ndarray, limit: float | None = None, *,
+               unknown: np.ndarray | None = None) -> np.ndarray:
         """Return undetermined combinations of the coefficients `rows`, (p, k).
 
-        Orthonormal in scaled coefficients (times `norm`); others are taken as known. Eigenvalues
-        up to `limit`, by default that of `rows`, count as zero.
+        Orthonormal in scaled coefficients (times `norm`); others are taken as known, but for those
+        that are `unknown`. Eigenvalues up to `limit`, by default that of `rows`, count as zero.
         """
-        values, vectors = self._spectrum if rows.all() else self._spectrum_of(rows)
+        values, vectors = self._spectrum if rows.all() else self._spectrum_of(rows, unknown)
         hidden = values <= (self.limit(rows) if limit is None else limit)
         out = np.zeros((len(rows), int(hidden.sum())))
         out[rows] = vectors[:, hidden]
@@ -271,10 +272,15 @@ class TermEquations:
         """Eigenvalues and eigenvectors of the scaled equations of all coefficients."""
         return self._spectrum_of(np.ones(self.n, dtype=bool))
 
-    def _spectrum_of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        scale = self.norm[rows]
-        values, vectors = np.linalg.eigh(
-            self.information[np.ix_(rows, rows)] / np.outer(scale, scale))
+    def _spectrum_of(self, rows: np.ndarray, unknown: np.ndarray | None = None
+                     ) -> tuple[np.ndarray, np.ndarray]:
+        scaled = self.information / np.outer(self.norm, self.norm)
+        told = scaled[np.ix_(rows, rows)]
+        if unknown is not None:
+            couple = scaled[np.ix_(rows, unknown)]
+            told = told - couple @ np.linalg.pinv(
+                scaled[np.ix_(unknown, unknown)], hermitian=True) @ couple.T
+        values, vectors = np.linalg.eigh(told)
         return values, vectors
 
     @cached_property
@@ -283,20 +289,28 @@ class TermEquations:
         return self.untold(self.free)
 
     def limit(self, rows: np.ndarray) -> float:
-        """Return the eigenvalue of the scaled equations of `rows` that counts as zero."""
-        return max(GAP, OVER_NOISE * float(self._noise_of_offsets[rows].max(initial=0.0)))
+        """Return the eigenvalue of the scaled equations of `rows` that counts as zero.
+
+        Offsets of lines are told apart from their noise only where they stand alone: among others
+        theirs is a combination of its own.
+        """
+        of_marks, of_lines = (float(part[rows].max(initial=0.0))
+                              for part in self._noise_of_offsets)
+        alone = self._noise_of_offsets[1][rows].all()
+        return max(GAP, OVER_NOISE * (of_lines if alone else of_marks))
 
     @cached_property
-    def _noise_of_offsets(self) -> np.ndarray:
-        """The part of the weighted square of every column that the noise of offsets makes, (p,).
+    def _noise_of_offsets(self) -> tuple[np.ndarray, np.ndarray]:
+        """The part of the weighted square of columns that the noise of offsets makes, (p,) each.
 
         Columns of marks hold the noise of one coordinate of every mean; those of lines, whose
         residuals leave no more of it, that of the rotation of every view.
         """
+        power = (self.noise_m / self.norm) ** 2
         marks = self.columns.having(lambda block: block.of_microscope)
         lines = self.columns.having(lambda block: block.of_offsets and block.of_lines)
-        values = self.system.grid.n_readings * marks + self.system.angular.n_views * lines
-        return values * (self.noise_m / self.norm) ** 2
+        return (self.system.grid.n_readings * power * marks,
+                self.system.angular.n_views * power * lines)
 
     @cached_property
     def maps(self) -> np.ndarray:
@@ -413,10 +427,17 @@ class TermEquations:
     @cached_property
     def free_inverse(self) -> np.ndarray:
         """Pseudo-inverse of the information: covariance of free coefficients, (p, p)."""
-        untold = self.untold(np.ones(self.n, dtype=bool))
-        scaled = self.information / np.outer(self.norm, self.norm)
-        held = np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
-        return held / np.outer(self.norm, self.norm)
+        return self.inverse_without(np.zeros(self.n, dtype=bool))
+
+    def inverse_without(self, known: np.ndarray) -> np.ndarray:
+        """Return the covariance of free coefficients (p, p) if those in `known` are known."""
+        free = ~known
+        untold, norm = self.untold(free)[free], self.norm[free]
+        scaled = self.information[np.ix_(free, free)] / np.outer(norm, norm)
+        out = np.zeros((self.n, self.n))
+        out[np.ix_(free, free)] = (np.linalg.inv(scaled + untold @ untold.T)
+                                   - untold @ untold.T) / np.outer(norm, norm)
+        return out
 
     def rank(self) -> int:
         """Return the number of combinations of all coefficients determined by the readings."""

@@ -370,7 +370,7 @@ def line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
     return out
 
 
-def without_noise(ground: TermInputs, residuals: tuple[np.ndarray, np.ndarray],
+def without_noise(ground: TermInputs, residuals: np.ndarray,
                   of_terms: Sequence[np.ndarray | float] = ()) -> TermInputs:
     """Return the ground with offsets from which the noise of the readings is taken off.
 
@@ -382,18 +382,17 @@ def without_noise(ground: TermInputs, residuals: tuple[np.ndarray, np.ndarray],
     ----------
     ground : TermInputs
         With the offsets as they were seen.
-    residuals : complex array (views, nx, ny), float array (views, lines)
-        Residuals of the means of the marks, plate frame, m, and of the lines, rad.
+    residuals : complex array (views, nx, ny)
+        Residuals of the means of the marks, plate frame, m.
     of_terms : sequence, optional
         What terms make of each visit of each view, (V,), plate frame, m; none without terms.
     """
     visits = []
     terms = of_terms or [0.0] * len(ground.visits)
-    of_marks, of_lines = residuals
-    for view, residual, known in zip(ground.visits, of_marks, terms, strict=True):
+    for view, residual, known in zip(ground.visits, residuals, terms, strict=True):
         if view is not None:
             rest = view.about_means((view.y - known)[None], residual.size)[0]
             rest = rest + residual.reshape(-1)[view.mark]
             view = replace(view, offset=view.offset - rest * np.conj(view.phase))
         visits.append(view)
-    return replace(ground, visits=tuple(visits), line_offsets=ground.line_offsets - of_lines)
+    return replace(ground, visits=tuple(visits))

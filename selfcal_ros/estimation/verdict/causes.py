@@ -459,7 +459,7 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
     problem = model.problem
     known = () if model.equations is None else model.equations.columns.at_visits(
         model.coefficients)
-    ground = without_noise(problem.ground, model.found.both_residuals, known)
+    ground = without_noise(problem.ground, model.found.residuals, known)
     own = [term.name for term in problem.terms]
     told = all(visits is not None for visits in ground.visits)
     more = [ModelTerm(block.name) for block in blocks().values()

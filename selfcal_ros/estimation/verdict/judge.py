@@ -95,7 +95,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
         failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(Finding("not_converged"))
-    failed += _sign_findings(checked, measurements, options)
+    signs = _sign_findings(checked, measurements, options)
+    failed += [found for found in signs if found.name == "sign_not_shown"]
     failed += _lines_sign_findings(checked, measurements, options)
     searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
     zero = {str(term.name) for term in options.terms if term.size == 0}
@@ -125,7 +126,8 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
         result, verdict=verdict,
-        findings=(*result.findings, *_visits_findings(checked), *_views_findings(measurements),
+        findings=(*result.findings, *[found for found in signs if found not in failed],
+                  *_visits_findings(checked), *_views_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
@@ -205,10 +207,11 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
 
 def _sign_findings(solved: Solved, measurements: Measurements,
                    options: Options) -> list[Finding]:
-    """Return a finding if nothing shows the sign of the offsets.
+    """Return a finding if nothing shows the sign of the offsets, or lines alone do.
 
     Repeats show it, or the joint fit does (through rotations that lines share, and their squares),
-    or the microscope was declared.
+    or the microscope was declared. Lines share them with the other sign as well if it is that of
+    their own offsets, too.
     """
     seen = all(view.visits is not None for view in measurements.views if len(view.m))
     if _is_declared(options) or not seen or sign_is_shown(measurements):  # nothing can show it
@@ -222,9 +225,19 @@ def _sign_findings(solved: Solved, measurements: Measurements,
              if equations.columns.columns[at].component == "scale"]
     if not scale or not np.isfinite(model.found.xy.sigma):
         return []
-    hidden = np.abs(equations.untold(rows)[scale[0]]).max(initial=0.0) > NEGLIGIBLE
-    variance = equations.free_inverse[scale[0], scale[0]] * model.found.xy.sigma**2
-    return [] if not hidden and 0 <= variance <= SIGN_U**2 else [Finding("sign_not_shown")]
+    lines = equations.columns.having(lambda block: block.of_offsets and block.of_lines)
+
+    def is_shown(*, by_lines: bool) -> bool:
+        untold = equations.untold(rows, unknown=None if by_lines else lines)
+        spread = equations.inverse_without(lines & by_lines)[scale[0], scale[0]]
+        hidden = np.abs(untold[scale[0]]).max(initial=0.0) > NEGLIGIBLE
+        return not hidden and 0 <= spread * model.found.xy.sigma**2 <= SIGN_U**2
+
+    if not is_shown(by_lines=True):
+        return [Finding("sign_not_shown")]
+    if is_shown(by_lines=False) or sign_of_lines_is_shown(measurements):
+        return []
+    return [Finding("sign_shown_by_lines")]
 
 
 def _is_declared(options: Options) -> bool:

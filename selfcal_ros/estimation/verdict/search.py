@@ -358,7 +358,7 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
     """
     known = next((term for term in options.model_terms(visits=True)
                   if term.block.of_microscope and not term.free), None)
-    twin = known and _with_wide(known, measurements, options)
+    twin = _with_wide(known, measurements, options) if known else None
     if known is None or twin is None:
         return False
     held = fitted_term(twin.joint, known.name)

@@ -177,6 +177,11 @@ SENTENCES: dict[str, Words] = {
         "nothing in the readings shows the sign of the microscope's offsets, and with the opposite "
         "sign the map would be that of a different stage: have the stage stop next to the marks "
         "deliberately (check_stops in the plan), or declare the microscope (--microscope 0.01)"),
+    "sign_shown_by_lines": lambda f, of: (
+        "only lines that turn with the marks show the sign of the microscope's offsets, and "
+        "nothing shows that of the lines: if both are opposite, the map is that of a different "
+        "stage: have the stage stop next to the marks deliberately (check_stops in the plan), or "
+        "declare the microscope (--microscope 0.01)"),
     "lines_sign_not_shown": lambda f, of: (
         "nothing in the readings shows the sign of offset_theta, and with the other sign the "
         "angular map would be that of a different stage: turn the plate by 0.1 mrad or more "

@@ -109,10 +109,10 @@ def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(readings
     assert searched == [True]
 
 
-def offsets_of(stop_sigma_m, servo_sigma_theta_rad):
+def offsets_of(stop_sigma_m, servo_sigma_theta_rad, phi_rad=1e-7):
     """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
-    spread = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
+    spread = Spread(encoder="independent", rotation="finite", phi_rad=phi_rad)
     settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                             servo_sigma_theta_rad=servo_sigma_theta_rad,
                             stop_sigma_m=stop_sigma_m)
@@ -130,6 +130,18 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     verdict = calibrate(offsets_of(*scatter), Options(**how)).verdict
     assert [found.name for found in verdict.failed] == asked
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
+
+
+@pytest.mark.parametrize(("scatter", "by_lines"), [
+    ((0.0, 0.0), True), ((20e-6, 0.0), False), ((0.0, 1e-4), False)])
+def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(scatter, by_lines):
+    """Marks and lines turn alike with both signs opposite: nothing contradicts that."""
+    readings = offsets_of(*scatter, phi_rad=1e-3)
+    result = calibrate(readings, Options())
+    assert result.verdict.grade is Grade.GOOD
+    assert ("sign_shown_by_lines" in [found.name for found in result.findings]) is by_lines
+    declared = calibrate(readings, Options(terms=parse_terms(["microscope:1e-2"], "")))
+    assert "sign_shown_by_lines" not in [found.name for found in declared.findings]
 
 
 @pytest.mark.parametrize("sense", Sense)
