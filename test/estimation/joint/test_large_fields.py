@@ -17,7 +17,8 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.normal import equations
-from selfcal_ros.estimation.observability.rank import plan_observability
+from selfcal_ros.estimation.observability import rank
+from selfcal_ros.estimation.observability.rank import deficiency, identifies
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from test.support.lattice_plans import plan_of
@@ -26,15 +27,21 @@ from test.support.truth import random_truth, simulate_measurements
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize(("names", "missing"), [
-    ("0,tx,ty", 0.0), ("0,180,tx", 0.0), ("0,90", 0.0), ("0,90,180,270", 0.0), ("0,90,tx", 0.0)])
-def test_the_core_of_a_large_plan_tells_its_rank_alone(monkeypatch, names, missing):
-    plan = plan_of(names, Artifact(21, 0.005))
-    small = plan_observability(plan)
-    monkeypatch.setattr(equations, "CORE", 9)
-    equations.system_of.cache_clear()
-    assert plan_observability(plan) == small
-    equations.system_of.cache_clear()
+@pytest.mark.parametrize(("names", "identified"), [
+    ("0,tx,ty", False), ("0,180,tx", False), ("0,90", False), ("0,90,180,270", False),
+    ("0,90,tx", True)])
+def test_the_middle_of_a_large_plan_tells_what_the_whole_does(monkeypatch, names, identified):
+    plan, sizes = plan_of(names, Artifact(21, 0.005)), []
+    assert identifies(plan.artifact, plan.views) == identified
+
+    def counted(system):
+        sizes.append(system.grid.n_sites)
+        return deficiency(system)
+
+    monkeypatch.setattr(rank, "FULL_SIZE", 9)
+    monkeypatch.setattr(rank, "deficiency", counted)
+    assert identifies(plan.artifact, plan.views) == identified
+    assert not identified or sizes == [81]
 
 
 def test_the_uncertainty_of_a_large_field_is_given_on_request(monkeypatch):
