@@ -426,8 +426,13 @@ class TermEquations:
 
     @cached_property
     def free_inverse(self) -> np.ndarray:
-        """Pseudo-inverse of the information: covariance of free coefficients, (p, p)."""
-        return self.inverse_without(np.zeros(self.n, dtype=bool))
+        """Pseudo-inverse of the information: covariance of free coefficients, (p, p).
+
+        The scale of the lines' offsets is known: beside a microscope and turns of lines that are
+        free it would explain noise alone.
+        """
+        return self.inverse_without(
+            self.columns.having(lambda block: block.of_offsets and block.of_lines))
 
     def inverse_without(self, known: np.ndarray) -> np.ndarray:
         """Return the covariance of free coefficients (p, p) if those in `known` are known."""

@@ -15,6 +15,7 @@ from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.terms import parse_terms
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.lattice_plans import plan_of
@@ -116,7 +117,8 @@ def test_micrometres_off_the_sites_are_nothing():
 
 def test_a_stage_at_the_sites_has_the_same_result_to_the_bit():
     _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), t_m=30e-6)
-    one, two = (result_to_dict(calibrate(readings, Options(at_places=at))) for at in (True, False))
+    one, two = (result_to_dict(worded(calibrate(readings, Options(at_places=at))))
+                for at in (True, False))
     for made in (one, two):
         made["provenance"].pop("created", None)
     assert one == two
