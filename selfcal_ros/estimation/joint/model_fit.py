@@ -183,6 +183,7 @@ class _State:
         self.found = fit(problem, self.y, self.theta)
         self.offset_steps = LATE
         self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
+        self.fell = self.rounds = False
         self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
         if problem.terms:
@@ -280,7 +281,9 @@ class _State:
         residuals = sigma_of(sums.between - total, sums.dof_between - dof)
         rounded = residuals[0] == 0  # the weight of nearly exact lines leaves nothing else
         self.problem = replace(
-            self.problem, residuals_xy=self.problem.residuals_xy if rounded else residuals,
+            self.problem,
+            residuals_xy=self.problem.residuals_xy if rounded or self._goes_round(
+                residuals[0]) else residuals,
             repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
             else self.problem.repeats_xy)
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
@@ -297,6 +300,14 @@ class _State:
             angular = replace(self.problem.angular, y=self.lines_read - taken)
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
             self.theta = angular_part(self.problem)
+
+    def _goes_round(self, sigma_m: float) -> bool:
+        """Return whether the noise grows again late, after it fell: lines count for it or not."""
+        before = self.problem.residuals_xy
+        if self.steps > LATE and before is not None:
+            self.rounds |= self.fell and sigma_m > before[0]
+            self.fell |= sigma_m < before[0]
+        return self.rounds
 
     def _of_terms(self, trait: Callable[[Block], bool] = lambda block: True) -> np.ndarray | float:
         """Return the effect of the terms with a trait on the readings, (views, nx, ny), m."""
