@@ -9,9 +9,9 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import RunValues, mean_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.reference import ReferenceLength
 from test.support.options import bare
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 

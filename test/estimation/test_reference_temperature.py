@@ -6,7 +6,7 @@ import pytest
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.options import ReferenceLength
+from selfcal_ros.model.reference import ReferenceLength
 
 
 @pytest.mark.parametrize(("kind", "expected"), [

@@ -8,12 +8,12 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate, robust_calibrate
 from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.quality import validation
 from selfcal_ros.estimation.quality.outliers import clean, noisy_views, residuals_of
 from selfcal_ros.estimation.quality.validation import validate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings, subset
+from selfcal_ros.model.reference import ReferenceLength
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of, values_of, with_values

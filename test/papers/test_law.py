@@ -8,10 +8,11 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.comparison.covariance import covariance_of
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.papers.law import _quadratic_form, hu_readings, hu_views, law_for

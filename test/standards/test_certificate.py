@@ -19,11 +19,12 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Part, combine
 from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Finding, Grade, Verdict
 from selfcal_ros.outputs import write_json

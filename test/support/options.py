@@ -3,7 +3,8 @@
 
 from typing import Any
 
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import Options
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.terms import ModelTerm
 
 

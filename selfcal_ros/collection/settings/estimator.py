@@ -6,12 +6,13 @@ from typing import Any
 
 from selfcal_ros.collection.settings.nodes import NO_TERMS, UNCERTAINTY, SolverSettings
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.files import csv_cells, read_text, read_yaml
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.terms import ModelTerm, default_terms, microscope_term, parse_terms
 from selfcal_ros.model.view import Plan
 from selfcal_ros.plain_numbers import number_of

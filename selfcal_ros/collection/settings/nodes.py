@@ -13,9 +13,9 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.collection.settings.parameter import ManagedSettings, Parameter, Settings, declared
 from selfcal_ros.compensation.cells import Interpolation, Outside
 from selfcal_ros.errors import InputError, known_are
-from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceKind
 from selfcal_ros.model.terms import DRIFT_DEGREE, MAX_DRIFT_DEGREE
 
 NO_TERMS = "none"

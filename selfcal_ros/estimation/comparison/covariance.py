@@ -31,10 +31,10 @@ from selfcal_ros.estimation.lattice.connectivity import Gauge
 from selfcal_ros.estimation.lattice.readings import Marks, in_field, pose_of
 from selfcal_ros.estimation.normal.angular import MAX_FULL
 from selfcal_ros.estimation.normal.equations import NormalEquations, system_of
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, first_order
 from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import View, shared_rotations

@@ -34,9 +34,9 @@ from selfcal_ros.estimation.normal.equations import (
     NormalEquations,
     in_datum,
 )
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.error_map import ThetaDatum, slope_rows
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 
 NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 """Noise that stands for none: its square is still a number."""

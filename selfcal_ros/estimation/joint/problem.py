@@ -25,11 +25,12 @@ from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import NormalEquations, angular_residuals, noise_of
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
 from selfcal_ros.estimation.terms.visits import TermInputs, between_visits, squares_within
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.terms import ModelTerm
 
 DECLARED_DOF = 8.0

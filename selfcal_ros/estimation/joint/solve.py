@@ -51,7 +51,7 @@ from selfcal_ros.estimation.normal.equations import (
 )
 from selfcal_ros.estimation.observability.plan_check import with_unseen_modes
 from selfcal_ros.estimation.observability.rank import identifies, measured_observability
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
@@ -69,6 +69,7 @@ from selfcal_ros.model.readings import (
     lines_turned_over,
     turned_over,
 )
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.result import (
     ArtifactMap,
     CalibrationResult,

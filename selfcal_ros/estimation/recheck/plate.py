@@ -31,11 +31,11 @@ from selfcal_ros.estimation.comparison.covariance import Together, together
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS
 from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import GAP
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.units import MM_PER_M

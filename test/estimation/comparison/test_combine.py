@@ -22,10 +22,11 @@ from selfcal_ros.estimation.comparison.combine import (
 )
 from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.joint.problem import coverage_factor
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.kept import Covariance, Kept
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict

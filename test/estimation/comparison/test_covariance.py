@@ -14,10 +14,10 @@ from selfcal_ros.estimation.comparison.covariance import (
     first_order_u,
 )
 from selfcal_ros.estimation.comparison.maps import compare
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.kept import Kept
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View

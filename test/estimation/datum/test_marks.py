@@ -10,9 +10,9 @@ from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.lattice_plans import plan_of
 from test.support.options import bare

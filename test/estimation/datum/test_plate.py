@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceKind
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.lattice_plans import plan_of
 from test.support.options import bare, reference_length

@@ -6,8 +6,8 @@ import pytest
 
 from selfcal_ros.estimation.datum.covariance import scale_of, scale_rows
 from selfcal_ros.estimation.normal.equations import planned_system
-from selfcal_ros.estimation.options import ReferenceKind
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.reference import ReferenceKind
 from test.support.lattice_plans import plan_of
 from test.support.options import reference_length
 

@@ -11,10 +11,10 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.estimation.joint.solve import solve_joint
-from selfcal_ros.estimation.options import ReferenceKind, ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense, subset
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.reporting.words.findings import worded
 from test.support.lattice_plans import in_datum, plan_of
 from test.support.map_covariance import map_covariance

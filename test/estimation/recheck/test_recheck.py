@@ -20,7 +20,6 @@ from selfcal_ros.estimation.comparison.covariance import (
 from selfcal_ros.estimation.joint import solve
 from selfcal_ros.estimation.joint.problem import noise_estimate
 from selfcal_ros.estimation.normal.angular import AngularSystem
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import _misfit, predict_recheck, recheck
 from selfcal_ros.estimation.recheck.views import Effects, map_of_lines
@@ -28,6 +27,7 @@ from selfcal_ros.estimation.terms.columns import LineColumns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from selfcal_ros.model.readings import Sense, subset
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Grade, Verdict

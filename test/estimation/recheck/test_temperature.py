@@ -9,12 +9,13 @@ from scipy.stats import binom
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options, ReferenceKind, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.standards.statements import is_traceable, scale_texts

@@ -13,9 +13,10 @@ from scipy.stats import t as student
 from selfcal_ros.compensation.export import provenance
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.options import Options, ReferenceLength
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.outputs import plain

@@ -8,9 +8,9 @@ import pytest
 
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import model_fit
-from selfcal_ros.estimation.options import ReferenceLength
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import View
