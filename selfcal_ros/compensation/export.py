@@ -13,7 +13,6 @@ from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, rms
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.outputs import to_ascii
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
@@ -156,9 +155,9 @@ def verdict_lines(result: CalibrationResult) -> list[str]:
 
 
 def _reference_lines(result: CalibrationResult) -> list[str]:
-    reference = result.reference
-    if not reference:
+    length = result.reference
+    if length is None:
         return ["reference length: none, the scale is a convention"]
-    certificate = reference.get("certificate") or "no certificate named"
-    return [f"reference length: {reference_name(reference)}, relative error "
-            f"{reference['relative_error']:g}, u {reference['u_relative']:g} ({certificate})"]
+    certificate = length.certificate or "no certificate named"
+    return [f"reference length: {length.name}, relative error "
+            f"{length.relative_error:g}, u {length.u_relative:g} ({certificate})"]

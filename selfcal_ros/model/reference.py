@@ -4,10 +4,12 @@
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
 from selfcal_ros.errors import InputError, check_celsius
+from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.plain_numbers import number_of, whole_number_of
 
@@ -33,6 +35,31 @@ class ReferenceKind(StrEnum):
 
 
 @dataclass(frozen=True)
+class Certified:
+    """The certificate of a length that was moved to the temperature of the measurement.
+
+    Attributes
+    ----------
+    relative_error, u_relative : float
+        As of `ReferenceLength`, at the temperature of the certificate.
+    temperature_c, u_temperature_k : float
+        Temperature in the measurement and its standard uncertainty, degC and K.
+    expansion_per_k, u_expansion_per_k : float
+        Coefficient of linear expansion and its standard uncertainty, 1/K.
+    certified_at_c : float
+        Temperature of the certificate, degC.
+    """
+
+    relative_error: float
+    u_relative: float
+    temperature_c: float
+    u_temperature_k: float
+    expansion_per_k: float
+    u_expansion_per_k: float
+    certified_at_c: float
+
+
+@dataclass(frozen=True)
 class ReferenceLength:
     """A length that sets the scale, which no view determines.
 
@@ -50,11 +77,13 @@ class ReferenceLength:
         Its standard uncertainty (k=1).
     certificate : str
         Certificate: number and issuer, as text.
-    certified : dict, optional
+    certified : Certified, optional
         If the numbers above were moved to the temperature of the measurement (`at_temperature`):
         those of the certificate, and what moved them.
     marks : pair of (int, int), optional
         (m, n) of the two marks.
+    runs : tuple of ReferenceLength
+        Of the mean of several runs with different lengths: that of each.
 
     Raises
     ------
@@ -67,8 +96,21 @@ class ReferenceLength:
     relative_error: float
     u_relative: float = 0.0
     certificate: str = ""
-    certified: dict[str, float] | None = None
-    marks: tuple[tuple[int, int], ...] | None = None
+    certified: Certified | None = None
+    marks: tuple[tuple[int, ...], ...] | None = None
+    runs: tuple["ReferenceLength", ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What was certified: the kind of the length, or its marks."""
+        if self.marks is None:
+            return str(self.kind)
+        return "distance of the marks {} and {}".format(*self.marks)
+
+    @property
+    def each(self) -> tuple["ReferenceLength", ...]:
+        """The lengths that were certified: one, or those of the runs of a mean."""
+        return self.runs or (self,)
 
     @classmethod
     def between(cls, text: str, artifact: Artifact, certificate: str = "") -> "ReferenceLength":
@@ -114,9 +156,8 @@ class ReferenceLength:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be relative errors, and marks that are not two."""
-        if self.marks is not None:  # lists in a file
-            object.__setattr__(self, "marks", tuple(tuple(mark) for mark in self.marks))
-        if (self.kind == ReferenceKind.MARKS) != (len(set(self.marks or ())) == 2):
+        two = len(set(self.marks or ())) == 2 and all(len(mark) == 2 for mark in self.marks or ())
+        if (self.kind == ReferenceKind.MARKS) != two:
             raise InputError("reference length", f"kind '{self.kind}' with the marks {self.marks}",
                              "the kind 'marks' needs two different marks, other kinds have none")
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
@@ -162,5 +203,23 @@ class ReferenceLength:
             self, relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
             u_relative=math.hypot(self.u_relative, known["expansion_per_k"]
                                   * known["u_temperature_k"], warmer * known["u_expansion_per_k"]),
-            certified={"relative_error": self.relative_error, "u_relative": self.u_relative,
-                       **known})
+            certified=Certified(self.relative_error, self.u_relative, **known))
+
+
+def reference_to_dict(length: ReferenceLength | None) -> dict[str, Any] | None:
+    """Return the JSON form of a reference length; null without one."""
+    if length is None:
+        return None
+    return {"kind": str(length.kind), "relative_error": length.relative_error,
+            "u_relative": length.u_relative, "certificate": length.certificate,
+            **({"certified": vars(length.certified)} if length.certified else {}),
+            **({"marks": [*map(list, length.marks)]} if length.marks else {}),
+            **({"runs": [*map(reference_to_dict, length.runs)]} if length.runs else {})}
+
+
+def reference_from_dict(raw: Any) -> ReferenceLength | None:
+    """Return the reference length of a result; ValueError or KeyError if invalid."""
+    try:
+        return None if raw is None else read(ReferenceLength, raw)
+    except InputError as error:
+        raise ValueError(str(error)) from error

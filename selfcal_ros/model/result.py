@@ -32,6 +32,7 @@ from selfcal_ros.model.plate_form import (
 )
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.recheck import Recheck
+from selfcal_ros.model.reference import ReferenceLength, reference_from_dict, reference_to_dict
 from selfcal_ros.model.verdict import (
     BudgetLine,
     Finding,
@@ -44,7 +45,6 @@ from selfcal_ros.model.verdict import (
     findings_from_list,
     line_to_dict,
     provenance_from_dict,
-    reference_from_dict,
     verdict_from_dict,
     verdict_to_dict,
 )
@@ -207,7 +207,7 @@ class CalibrationResult:
     kept: Kept = Kept()
     verdict: Verdict = Verdict(Grade.GOOD)
     model: ModelResult = ModelResult()
-    reference: dict[str, Any] | None = None
+    reference: ReferenceLength | None = None
     provenance: Provenance = Provenance()
     run_id: str = ""
     findings: tuple[Finding, ...] = ()
@@ -301,7 +301,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "run_id": result.run_id,
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(result.model),
-        "reference": result.reference,
+        "reference": plain(reference_to_dict(result.reference)),
         "provenance": plain({"created": provenance.created, "duration_s": provenance.duration_s,
                              "version": provenance.version, **provenance.extra}),
         "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),

@@ -240,10 +240,6 @@ class Provenance:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-REFERENCES = ("artifact", "stage_x", "stage_y", "marks")
-"""Kinds of a reference length."""
-
-
 def finding_to_dict(found: Finding) -> dict[str, Any]:
     """Return the JSON form of a finding, or of a cause.
 
@@ -310,28 +306,3 @@ def provenance_from_dict(data: dict | None) -> Provenance:
     known = ("created", "duration_s", "version")
     return Provenance() if data is None else read(Provenance, data | {
         "extra": {key: value for key, value in data.items() if key not in known}})
-
-
-def reference_from_dict(raw: Any) -> dict[str, Any] | None:
-    """Return the reference length of a result; ValueError if invalid."""
-    if raw is None:
-        return None
-    if read(dict, raw)["kind"] not in REFERENCES:
-        raise ValueError(f"the reference {raw['kind']!r} is unknown")
-    error, u = read(float, raw["relative_error"]), read(float, raw["u_relative"])
-    if not (abs(error) < 0.1 and 0 <= u < 0.1):
-        raise ValueError(f"reference: {error!r} with u {u!r} is not a relative error")
-    read(str, raw.get("certificate") or "")
-    for value in read(dict, raw.get("certified") or {}).values():
-        read(float, value)
-    marks = [read(tuple[int, ...], mark) for mark in read(list, raw.get("marks") or [])]
-    if (raw["kind"] == "marks") != (len(set(marks)) == 2 == len(marks[0]) == len(marks[1])):
-        raise ValueError(f"reference: the marks {marks} do not fit the kind {raw['kind']!r}")
-    return raw
-
-
-def reference_name(reference: dict[str, Any]) -> str:
-    """Return what was certified: the kind of a reference length, or its marks."""
-    if reference["kind"] != "marks":
-        return str(reference["kind"])
-    return "distance of the marks {} and {}".format(*map(tuple, reference["marks"]))

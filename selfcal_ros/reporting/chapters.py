@@ -12,6 +12,7 @@ from selfcal_ros import __version__
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
+from selfcal_ros.model.reference import reference_to_dict
 from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
@@ -214,9 +215,9 @@ def provenance_section(result: CalibrationResult) -> Section:
         ("run", result.run_id), *made.extra.items()) if value]
     if math.isfinite(made.duration_s):
         facts.append(("duration", f"{made.duration_s:.0f} s from the first exposure to the last"))
-    if result.reference:
+    if length := reference_to_dict(result.reference):
         facts += [(f"reference {_words(key)}", said(value))
-                  for key, value in result.reference.items() if value != ""]
+                  for key, value in length.items() if value != ""]
     return Section("Provenance", tuple(facts))
 
 

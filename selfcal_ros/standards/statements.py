@@ -9,7 +9,6 @@ from typing import Any
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import reference_name
 from selfcal_ros.units import UM_PER_M
 
 TRACEABILITY, AGREEMENT = "Metrological traceability", "Agreement of readings and model"
@@ -51,13 +50,10 @@ def _require_temperature(result: CalibrationResult, conditions: list[dict[str, A
 
     It may differ between the runs of a mean.
     """
-    reference = result.reference or {}
-    known = reference.get("certified")
-    if not known or "runs" in reference:
+    length = result.reference
+    if length is None or length.certified is None or length.runs or not length.kind.of_plate:
         return
-    if reference["kind"].startswith("stage"):
-        return
-    used, u = known["temperature_c"], known["u_temperature_k"]
+    used, u = length.certified.temperature_c, length.certified.u_temperature_k
     for item in conditions:
         if item.get("unit") == "degC" and "plate" in item["name"] and (
                 abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9):
@@ -69,9 +65,9 @@ def _require_temperature(result: CalibrationResult, conditions: list[dict[str, A
 
 def is_traceable(result: CalibrationResult) -> bool:
     """Return whether certified lengths, at the temperature of the measurement, set the scale."""
-    reference = result.reference or {}
-    return all(found.get("certificate") and found.get("certified") and found.get("u_relative")
-               for found in reference.get("runs", [reference]))
+    return result.reference is not None and all(
+        found.certificate and found.certified and found.u_relative
+        for found in result.reference.each)
 
 
 def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]]:
@@ -110,8 +106,7 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
 
 def scale_texts(result: CalibrationResult) -> list[str]:
     """Return what sets the scale of a map, and whether it is traceable."""
-    reference = result.reference
-    if not reference:
+    if result.reference is None:
         why = ("the temperature of the known plate in this measurement was not stated"
                if result.recheck is not None else "no reference length was used")
         return [f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
@@ -120,18 +115,17 @@ def scale_texts(result: CalibrationResult) -> list[str]:
     if result.recheck is not None:
         texts.append("The scale is that of the known plate, set at its calibration and converted "
                      "to the temperature of this measurement as follows.")
-    for found in reference.get("runs", [reference]):
-        texts.append(f"The scale is set by a reference length ({reference_name(found)}): relative "
-                     f"error {found['relative_error']:.4g}, standard uncertainty "
-                     f"{found['u_relative']:.3g}; certificate: "
-                     f"{found.get('certificate') or 'none'}.")
-        if known := found.get("certified"):
+    for found in result.reference.each:
+        texts.append(f"The scale is set by a reference length ({found.name}): relative "
+                     f"error {found.relative_error:.4g}, standard uncertainty "
+                     f"{found.u_relative:.3g}; certificate: {found.certificate or 'none'}.")
+        if known := found.certified:
             texts.append(
-                f"Certified at {known['certified_at_c']:g} °C: {known['relative_error']:.4g}, "
-                f"standard uncertainty {known['u_relative']:.3g}; used at "
-                f"{known['temperature_c']:g} °C (u {known['u_temperature_k']:g} K) with the "
-                f"expansion coefficient {known['expansion_per_k']:.4g} 1/K "
-                f"(u {known['u_expansion_per_k']:.2g} 1/K).")
+                f"Certified at {known.certified_at_c:g} °C: {known.relative_error:.4g}, "
+                f"standard uncertainty {known.u_relative:.3g}; used at "
+                f"{known.temperature_c:g} °C (u {known.u_temperature_k:g} K) with the "
+                f"expansion coefficient {known.expansion_per_k:.4g} 1/K "
+                f"(u {known.u_expansion_per_k:.2g} 1/K).")
     if not is_traceable(result):
         texts.append("Not traceable: this needs a certificate, its uncertainty, and the "
                      "temperature of the reference (--certificate, --reference-at).")

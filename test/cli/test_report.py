@@ -138,10 +138,10 @@ ROW = {"quantity": "xy", "component": "reading noise", "type": "A", "value": 0.0
 
 
 @pytest.mark.parametrize(("key", "value", "said"), [
-    ("reference", REFERENCE | {"kind": "moon"}, "the reference 'moon' is unknown"),
+    ("reference", REFERENCE | {"kind": "moon"}, "'moon' is not a valid ReferenceKind"),
     ("reference", REFERENCE | {"relative_error": "x"}, "'x' is not a number"),
-    ("reference", REFERENCE | {"u_relative": None}, "with u nan is not a relative error"),
-    ("reference", REFERENCE | {"u_relative": -1.0}, "with u -1.0 is not a relative error"),
+    ("reference", REFERENCE | {"u_relative": None}, "nan is not a standard uncertainty"),
+    ("reference", REFERENCE | {"u_relative": -1.0}, "-1.0 is not a standard uncertainty"),
     ("reference", REFERENCE | {"certificate": 3}, "3 is not of type str"),
     ("reference", {}, "the key 'kind' is missing"),
     ("reference", [], "[] is not of type dict"),

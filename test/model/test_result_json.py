@@ -11,6 +11,7 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
     Observability,
     result_from_dict,
@@ -158,9 +159,9 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
     data = result_to_dict(known_result()[0])
     data["reference"] = {"kind": "stage_x", "relative_error": error, "u_relative": u}
     if is_one:
-        assert result_from_dict(data, "r").reference == data["reference"]
+        assert result_from_dict(data, "r").reference == ReferenceLength("stage_x", error, u)
         return
-    with pytest.raises(InputError, match=f"reference: {error!r} with u {u!r} is not a relative"):
+    with pytest.raises(InputError, match=r"^r: .*reference length: .* is not a (relative|stand)"):
         result_from_dict(data, "r")
 
 

@@ -50,6 +50,7 @@ from selfcal_ros.model.error_map import (
     rms,
 )
 from selfcal_ros.model.recheck import Significance
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
     COMBINED,
     ArtifactMap,
@@ -131,7 +132,7 @@ def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def shared_reference(results: Sequence[CalibrationResult | None],
-                     weights: np.ndarray) -> dict[str, Any] | None:
+                     weights: np.ndarray) -> ReferenceLength | None:
     """Return what sets the scale of a mean that keeps it: the reference lengths of its runs.
 
     Parameters
@@ -144,28 +145,25 @@ def shared_reference(results: Sequence[CalibrationResult | None],
 
     Returns
     -------
-    dict or None
+    ReferenceLength or None
         None if a run has no reference length; that of all runs if it is the same; otherwise
-        the weighted mean, with the reference of each under ``runs``.
+        the weighted mean, with that of each in `runs`.
     """
     own = [result for result in results if result is not None]
     found = [result.reference for result in own if result.reference]
     if len(found) < len(own):
         return None
     if len(own) < len(results):
-        found = [_uncertified(each) for each in found]
+        found = [replace(each, certified=None) for each in found]
     if all(each == found[0] for each in found):
         return found[0]
     share = np.array([weight for result, weight in zip(results, weights, strict=True) if result])
-    errors = np.array([each["relative_error"] for each in found])
-    names = dict.fromkeys(each.get("certificate") or "none" for each in found)
-    return {**_uncertified(found[0]), "relative_error": float(share @ errors / share.sum()),
-            "u_relative": max(each["u_relative"] for each in found),
-            "certificate": "; ".join(names), "runs": found}
-
-
-def _uncertified(reference: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in reference.items() if key != "certified"}
+    errors = np.array([each.relative_error for each in found])
+    names = dict.fromkeys(each.certificate or "none" for each in found)
+    return replace(
+        found[0], certified=None, relative_error=float(share @ errors / share.sum()),
+        u_relative=max(each.u_relative for each in found), certificate="; ".join(names),
+        runs=tuple(found))
 
 
 def exposures(results: Sequence[CalibrationResult | None]) -> dict[str, str]:
@@ -663,7 +661,7 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
     factors = factors * np.nan_to_num(result.noise.sigma_xy)
     if keep_scale and result.reference is not None:
         at = result.artifact
-        place = np.concatenate([at.x_m[known], at.y_m[known]]) * result.reference["u_relative"]
+        place = np.concatenate([at.x_m[known], at.y_m[known]]) * result.reference.u_relative
         factors = np.concatenate([factors, place[None]])
     return factors
 

@@ -34,7 +34,6 @@ from selfcal_ros.estimation.normal.equations import NormalEquations, system_of
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, first_order
 from selfcal_ros.model.kept import FACTORS, Covariance, Factors, ImagesKept, Kept
 from selfcal_ros.model.readings import Sense, lines_turned_over, turned_over
-from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import View, shared_rotations
@@ -282,11 +281,10 @@ class Together:
     def maps(self) -> MapsCovariance:
         """Covariance of both maps for unit noise, without terms of the model."""
         result, system = self.result, self.system
-        reference = None if result.reference is None else ReferenceLength(**result.reference)
         noise, length = result.noise, self.half_width_m
         ratio = bounded_ratio(system, noise.sigma_xy, noise.sigma_theta,
                               length) if system.angular.n_views else 1.0
-        return MapsCovariance(system, system.inverse(ratio), reference, half_width_m=length,
+        return MapsCovariance(system, system.inverse(ratio), result.reference, half_width_m=length,
                               sigma_m=noise.sigma_xy)
 
     @cached_property

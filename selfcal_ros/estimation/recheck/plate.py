@@ -9,7 +9,6 @@ from one mark to the next.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Finding
 from selfcal_ros.units import MM_PER_M
@@ -53,7 +52,7 @@ class KnownPlate:
         What it knows of stage and plate together.
     where : str
         Its file, for messages.
-    reference : dict or None
+    reference : ReferenceLength, optional
         Reference length of the calibration at the temperature of the plate now; None if that
         temperature or the length is not known: then no map has a scale.
     """
@@ -61,7 +60,7 @@ class KnownPlate:
     result: CalibrationResult
     together: Together
     where: str
-    reference: dict[str, Any] | None = None
+    reference: ReferenceLength | None = None
 
     @property
     def field(self) -> np.ndarray:
@@ -72,14 +71,14 @@ class KnownPlate:
         plate, lattice = self.result.artifact_map, self.result.plate
         longer = 0.0
         if self._lengths is not None:
-            now, then = (each["relative_error"] for each in self._lengths)
-            longer = now - then
+            now, then = self._lengths
+            longer = now.relative_error - then.relative_error
         nominal = lattice.x_m + 1j * lattice.y_m
         return np.where(self.together.marks, plate.ax + 1j * plate.ay + longer * nominal,
                         complex(np.nan, np.nan))
 
     @property
-    def _lengths(self) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    def _lengths(self) -> tuple[ReferenceLength, ReferenceLength] | None:
         """Reference lengths now and at the calibration; None if one is not known."""
         now, then = self.reference, self.result.reference
         return None if now is None or then is None else (now, then)
@@ -89,19 +88,20 @@ class KnownPlate:
         """Variance of the plate's length now beyond that at its calibration, 1 = (m/m)^2."""
         if self._lengths is None:
             return 0.0
-        now, then = (each["u_relative"] for each in self._lengths)
-        return max(now**2 - then**2, 0.0)
+        now, then = self._lengths
+        return max(now.u_relative**2 - then.u_relative**2, 0.0)
 
     @property
     def variance_of_expansion(self) -> float:
         """Variance of the expansion since the calibration, by both temperatures, (m/m)^2."""
         if self._lengths is None:
             return 0.0
-        now, then = (each["certified"] for each in self._lengths)
-        u_kelvin = np.hypot(now["u_temperature_k"], then["u_temperature_k"])
-        warmer = now["temperature_c"] - then["temperature_c"]
-        return float((now["expansion_per_k"] * u_kelvin)**2
-                     + (warmer * now["u_expansion_per_k"])**2)
+        now, then = (length.certified for length in self._lengths)
+        if now is None or then is None:
+            return 0.0
+        u_kelvin = np.hypot(now.u_temperature_k, then.u_temperature_k)
+        warmer = now.temperature_c - then.temperature_c
+        return float((now.expansion_per_k * u_kelvin)**2 + (warmer * now.u_expansion_per_k)**2)
 
     def length_at(self, marks: np.ndarray) -> np.ndarray:
         """Return what a relative expansion of 1 adds to Ax, Ay of marks, and to the microscope.
@@ -119,7 +119,7 @@ class KnownPlate:
         return np.array([found.get(part, 0.0 if found else np.nan) for part in MICROSCOPE_PARTS])
 
 
-def reference_now(result: CalibrationResult, where: str, at: str) -> dict[str, Any] | None:
+def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLength | None:
     """Return the reference length of a calibration at the temperature of its plate now.
 
     Parameters
@@ -140,22 +140,20 @@ def reference_now(result: CalibrationResult, where: str, at: str) -> dict[str, A
     """
     if not at:
         return None
-    reference = result.reference or {}
-    certified = reference.get("certified")
-    if not certified or not ReferenceKind(reference["kind"]).of_plate:
+    before = result.reference
+    if before is None or before.certified is None or not before.kind.of_plate:
         raise InputError("--reference-at", f"{where} has no reference length of its plate with the "
                          "temperature of the calibration", "leave it out: the map then has no "
                          "scale; or calibrate with --reference and --reference-at")
-    length = ReferenceLength(
-        reference["kind"], certified["relative_error"], certified["u_relative"],
-        reference.get("certificate") or "", marks=reference.get("marks")).at_temperature(at)
-    assert length.certified is not None
+    certified = before.certified
+    now = replace(before, relative_error=certified.relative_error,
+                  u_relative=certified.u_relative).at_temperature(at)
     for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
-        if not np.isclose(length.certified[name], certified[name], rtol=1e-9, atol=0.0):
-            raise InputError("--reference-at", f"{name} is {length.certified[name]:g}, and "
-                             f"{certified[name]:g} in {where}", "change the temperature alone")
-    return {**reference, "relative_error": length.relative_error,
-            "u_relative": length.u_relative, "certified": length.certified}
+        changed, known = getattr(now.certified, name), getattr(certified, name)
+        if not np.isclose(changed, known, rtol=1e-9, atol=0.0):
+            raise InputError("--reference-at", f"{name} is {changed:g}, and {known:g} in {where}",
+                             "change the temperature alone")
+    return now
 
 
 def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPlate:

@@ -106,12 +106,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
         solved = searched.solved
         noises = _noise_findings(solved)
     failed += _scale_findings(solved if own else checked, measurements, options, causes)
-    reference = options.reference
-    result = replace(solved.result, reference=None if reference is None else {
-        "kind": str(reference.kind), "relative_error": reference.relative_error,
-        "u_relative": reference.u_relative, "certificate": reference.certificate,
-        **({"certified": reference.certified} if reference.certified else {}),
-        **({"marks": [*map(list, reference.marks)]} if reference.marks else {})})
+    result = replace(solved.result, reference=options.reference)
     effects = [*searched.effects, *_beyond_repeats(solved)]
     result = with_coverage(enlarged(result, [*effects, *untold_effects(solved, options)]))
     bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)

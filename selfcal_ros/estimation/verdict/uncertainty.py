@@ -8,7 +8,6 @@ comparisons of maps and budgets use. The budget lists labelled components as the
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from selfcal_ros.estimation.options import OWED
 from selfcal_ros.model.error_map import CELL_MEAN, error_halfway, rms
 from selfcal_ros.model.kept import rounded
 from selfcal_ros.model.readings import lines_turned_over, turned_over
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
@@ -141,7 +141,7 @@ def remaining_part(term: TermResult) -> float:
 
 def variance_of_reference(result: CalibrationResult) -> np.ndarray:
     """Return the contribution of the reference length to the variance, (2, nx, ny), m^2."""
-    u = 0.0 if result.reference is None else float(result.reference["u_relative"])
+    u = 0.0 if result.reference is None else result.reference.u_relative
     return (u * np.stack([result.artifact.x_m, result.artifact.y_m])) ** 2
 
 
@@ -349,13 +349,13 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": part})
 
 
-def _reference_line(u: np.ndarray, reference: dict[str, Any] | None) -> BudgetLine:
+def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetLine:
     if reference is None:
         return BudgetLine("xy", "reference length", "B", 0.0, 0.0, "m/m", 0.0, 0.0, np.inf,
                           "default")
-    return BudgetLine("xy", "reference length", "B", reference["relative_error"],
-                      reference["u_relative"], "m/m", rms(u), float(u.max()), np.inf, "declared",
-                      {"kind": reference["kind"]})
+    return BudgetLine("xy", "reference length", "B", reference.relative_error,
+                      reference.u_relative, "m/m", rms(u), float(u.max()), np.inf, "declared",
+                      {"kind": str(reference.kind)})
 
 
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:

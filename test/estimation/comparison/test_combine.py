@@ -217,7 +217,7 @@ def test_a_reference_length_is_kept_once():
     np.testing.assert_allclose(kept.xy.common, place**2, rtol=1e-3, atol=1e-22)
     assert not removed.xy.common.any()
     assert removed.result.reference is None
-    assert kept.result.reference["certificate"] == "PTB 1"
+    assert kept.result.reference.certificate == "PTB 1"
     scale = np.polyfit(ARTIFACT.x_m.ravel(), kept.result.error_map.gx.ravel(), 1)[0]
     each = [np.polyfit(ARTIFACT.x_m.ravel(), p.error_map.gx.ravel(), 1)[0] for p in runs]
     assert min(each) < scale < max(each)

@@ -79,7 +79,7 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
 
 def test_what_was_converted_is_stated():
     told, _ = session(1, 0.5)
-    assert told.reference["certified"]["temperature_c"] == pytest.approx(20.9, abs=0.2)
+    assert told.reference.certified.temperature_c == pytest.approx(20.9, abs=0.2)
     assert "converted to the temperature of this measurement" in scale_texts(told)[0]
     by_kind = {line.component: line for line in told.budget}
     assert by_kind["plate temperature"].kind == "B" and by_kind["plate temperature"].u > 0

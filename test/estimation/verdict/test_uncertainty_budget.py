@@ -13,6 +13,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.verdict import Grade
@@ -145,7 +146,7 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
 def test_reference_length_grows_with_the_distance_from_the_centre():
     result = calibrated()
     assert parts_of(budgets(result)[0])["reference length"].effect_rms == 0.0
-    reference = {"kind": "artifact", "relative_error": 0.0, "u_relative": 1e-6, "certificate": ""}
+    reference = ReferenceLength("artifact", 0.0, 1e-6)
     part = parts_of(drawn_up(result, reference=reference)[0])["reference length"]
     assert part.effect_max == pytest.approx(1e-6 * 0.04)
     assert part.effect_rms == pytest.approx(1e-6 * np.sqrt((ARTIFACT.x_m**2).mean()))
@@ -158,7 +159,7 @@ def test_the_reference_is_not_counted_twice():
     own = 3e-7 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
     emap = result.error_map
     with_scale = replace(emap, u_gx=np.hypot(emap.u_gx, own[0]), u_gy=np.hypot(emap.u_gy, own[1]))
-    reference = {"kind": "artifact", "relative_error": 0.0, "u_relative": 3e-7, "certificate": ""}
+    reference = ReferenceLength("artifact", 0.0, 3e-7)
     found = parts_of(drawn_up(result, error_map=with_scale, reference=reference)[0])
     assert found["reading noise"].effect_rms == pytest.approx(noise.effect_rms)
     assert found["reading noise"].effect_max == pytest.approx(noise.effect_max)
