@@ -138,7 +138,7 @@ def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
 def first_order(artifact: Artifact, g_m: np.ndarray) -> tuple[float, float]:
     """Return O and R (Hu eq. 6) of a map (2, nx, ny), m; NaN where it is unknown."""
     known = np.isfinite(g_m).all(axis=0)
-    half_m = max(artifact.half) * artifact.grid_pitch_m
+    half_m = float(np.abs([artifact.x_m, artifact.y_m]).max())
     x, y = artifact.x_m / half_m, artifact.y_m / half_m
     rigid = datum_modes(artifact, scale=True)
     rigid[2:] /= half_m

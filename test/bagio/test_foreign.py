@@ -20,6 +20,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.messages import to_model
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign
@@ -37,14 +38,14 @@ def events():
 
 @pytest.fixture(scope="module")
 def expected(events):
-    return result_to_dict(calibrate(collected(events)[1], Options()))
+    return result_to_dict(worded(calibrate(collected(events)[1], Options())))
 
 
 def calibrated(measurements):
     """Return the result of readings; the same ones, to the last bit, are calibrated once."""
     key = pickle.dumps(measurements)
     if key not in CALIBRATED:
-        CALIBRATED[key] = result_to_dict(calibrate(measurements, Options()))
+        CALIBRATED[key] = result_to_dict(worded(calibrate(measurements, Options())))
     return CALIBRATED[key]
 
 
@@ -262,7 +263,7 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
         solved(tmp_path / "bag")
     check(tmp_path / "bag", expected, namespace="cell1")
     result, lost = solved(tmp_path / "bag", namespace="/cell2")
-    assert result == result_to_dict(calibrate(collected(other)[1], Options()))
+    assert result == result_to_dict(worded(calibrate(collected(other)[1], Options())))
     assert lost == []
     with pytest.raises(NoDataError, match="no topics of the cell '/cell3'; choose one of "
                        "/cell1, /cell2"):

@@ -17,7 +17,7 @@ def test_a_warm_plate_is_longer_and_a_warm_scale_indicates_less(kind, expected):
     assert found.relative_error == pytest.approx(expected)
     assert found.u_relative == pytest.approx((3e-7**2 + (8e-6 * 0.1)**2 + (3 * 1e-7)**2)**0.5)
     assert found.certificate == "PTB 1"
-    assert found.certified == {
+    assert vars(found.certified) == {
         "relative_error": 1e-6, "u_relative": 3e-7, "temperature_c": 23.0, "u_temperature_k": 0.1,
         "expansion_per_k": 8e-6, "u_expansion_per_k": 1e-7, "certified_at_c": 20.0}
 

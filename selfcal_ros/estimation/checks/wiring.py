@@ -407,9 +407,8 @@ def with_offsets(view: ViewReadings, visits: GridVisits, change: np.ndarray,
     back : float array (2, 2)
         Slope of the other offsets on these.
     """
-    weight = visits.u**-2 if len(visits.u) and np.isfinite(visits.u).all() else visits.count
-    total = np.bincount(visits.mark, weight, len(view.m))
-    dx, dy = (np.bincount(visits.mark, weight * part, len(view.m)) / total
+    weight = visits.count / np.bincount(visits.mark, visits.count, len(view.m))[visits.mark]
+    dx, dy = (np.bincount(visits.mark, weight * part, len(view.m))
               for part in (change.real, change.imag))
     return replace(
         view, dx=view.dx + dx, dy=view.dy + dy, motion=_turned_motion(view.motion, back),

@@ -118,6 +118,9 @@ def grid_data(measurements: Measurements) -> GridData:
         if not len(readings.dx) == len(readings.dy) == len(flat):
             raise InputError(where, "marks and deviations differ in length",
                              "give one value a mark")
+        if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
+            # before it is turned: infinity by a complex number warns
+            raise InputError(where, "a deviation is not a finite number", "remove the mark")
         values = (readings.dx + 1j * readings.dy) * pose.phase.conjugate()
         _place(y[row].reshape(-1), weight[row].reshape(-1), flat, values=values,
                count=readings.count, where=where)
