@@ -48,7 +48,7 @@ class MapsOfOneNode:
                  inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]) -> None:
         self._node = node
         self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
-        self._waiting: deque[tuple[float, Callable[[], None]]] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque(maxlen=MOST_WAITING)
         self._rivals, self._rivals_s = "", 0.0  # last seen
         self._subscriptions: list[Any] = []
         self._subscribe()
@@ -72,9 +72,12 @@ class MapsOfOneNode:
     def _receive(self, topic: str, take: Callable[[Any], None], message: Any) -> None:
         """Keep a message until its publisher has been alone for long enough."""
         if self._has_rivals():
-            raise InputError(topic, f"a message is not used: {self._rivals}",
-                             "end all publishers but one")
-        self._waiting.append((time.monotonic(), partial(take, message)))
+            raise self._of_several(topic)
+        self._waiting.append((time.monotonic(), topic, partial(take, message)))
+
+    def _of_several(self, topic: str) -> InputError:
+        return InputError(topic, f"a message is not used: {self._rivals}",
+                          "end all publishers but one")
 
     def _has_rivals(self) -> bool:
         rivals = names.rivals(self._node, [topic.name for topic, _ in self._inputs])
@@ -83,7 +86,9 @@ class MapsOfOneNode:
         if not self._rivals:
             self._node.say(Level.WARN, f"{rivals}: {KEPT}")
         self._rivals, self._rivals_s = rivals, time.monotonic()
-        self._waiting.clear()
+        while self._waiting:  # whose they are cannot be told either
+            _, topic, _ = self._waiting.popleft()
+            self._node.refusals.add(topic, self._of_several(topic))
         return True
 
     def _look(self) -> None:
@@ -97,7 +102,7 @@ class MapsOfOneNode:
             self.close()
             self._subscribe()
         while self._waiting and now_s - self._waiting[0][0] >= ALONE_S:
-            _, take = self._waiting.popleft()
+            _, _, take = self._waiting.popleft()
             take()
 
 

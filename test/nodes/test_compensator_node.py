@@ -17,7 +17,7 @@ from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.nodes import names
+from selfcal_ros.nodes import compensator, names
 from selfcal_ros.nodes.compensator import KEPT, CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.sessions.compensating import KEEPS_UP
@@ -233,7 +233,7 @@ def test_a_map_of_a_second_node_is_not_used_until_one_is_left(graph, leaves):
     graph.until(lambda: any(KEPT in status.message and status.level == b"\x01"
                             and "2 publishers: /intruder, /solver" in status.message
                             for array in heard for status in array.status), "the warning")
-    assert node.refusals.counts[names.ERROR_MAP.name] > 0
+    graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
     graph.remove(others[leaves])
     kept = {"intruder": MAP, "solver": OTHER}[leaves]
     graph.until(lambda: node.session.compensator is not first, "the latched map of who is left")
@@ -247,6 +247,18 @@ def test_of_two_nodes_that_were_there_before_no_map_is_used(graph):
         publish_map(graph, other, error_map, number + 1)
     node = graph.node(CompensatorNode)
     graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
+    assert node.session.compensator is None
+
+
+def test_a_map_that_waits_when_a_second_node_is_found_is_counted(graph, monkeypatch):
+    monkeypatch.setattr(compensator, "ALONE_S", PATIENCE_S)
+    monkeypatch.setattr(names, "rivals", lambda node, topics: "")
+    node = graph.node(CompensatorNode)
+    latch_map(graph)
+    graph.until(lambda: len(node._maps._waiting) == 2, "map and summary")
+    monkeypatch.setattr(names, "rivals", lambda node, topics: "two nodes publish")
+    graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] == 1, "the refusal")
+    assert node.refusals.counts[names.SUMMARY.name] == 1 and not node._maps._waiting
     assert node.session.compensator is None
 
 

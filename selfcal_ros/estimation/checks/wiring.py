@@ -407,7 +407,12 @@ def with_offsets(view: ViewReadings, visits: GridVisits, change: np.ndarray,
     back : float array (2, 2)
         Slope of the other offsets on these.
     """
-    weight = visits.count / np.bincount(visits.mark, visits.count, len(view.m))[visits.mark]
+    weight = visits.count
+    if len(visits.u) and np.isfinite(visits.u).all() and (visits.u > 0).all():
+        least = np.full(len(view.m), np.inf)
+        np.minimum.at(least, visits.mark, visits.u)
+        weight = (least[visits.mark] / visits.u) ** 2  # one of each mark is 1, however small
+    weight = weight / np.bincount(visits.mark, weight)[visits.mark]
     dx, dy = (np.bincount(visits.mark, weight * part, len(view.m))
               for part in (change.real, change.imag))
     return replace(
