@@ -482,8 +482,7 @@ def fit_model(problem: Problem,
     it doubtful, the fit is repeated with the largest size that they allow. A term that all views
     share, or a turn of lines, comes first if it explains all by itself: marks that turn against
     lines as a microscope of another scale turns them are not plates that moved between both, nor
-    bent ones. If several that all views share do, as the scales of the offsets of marks and lines,
-    each is repeated so.
+    bent ones.
 
     Parameters
     ----------
@@ -501,37 +500,16 @@ def fit_model(problem: Problem,
     sizes = _size_tests(model, problem.terms)
     if not any(test.raised for test in sizes):
         return replace(model, sizes=sizes)
-    explained = list(_explained_by_one(model, check))
-    alike = [alone for term, alone, _ in explained if term.block.shared]
-    if len(alike) > 1:
-        alone = tuple(test for tests in alike for test in tests)
-        rest = _rest_of_tests(problem, alone, check)
-        sizes = (*alone, *rest)
-    elif explained:
-        _, alone, rest = explained[0]
-        sizes = (*alone, *rest)
-    return replace(settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms)
-
-
-def _explained_by_one(model: ModelFit, check: Callable[[TermEquations], None]
-                      ) -> Iterator[tuple[ModelTerm, tuple[SizeTest, ...], tuple[SizeTest, ...]]]:
-    """Yield the terms with which alone nothing is contradicted, their tests and those of others."""
-    terms = model.problem.terms
-    for term in terms:
+    for term in problem.terms:
         first = term.block.shared or term.block.between
         alone = _size_tests(model, [term] if first else [])
         if any(test.contradicted for test in alone):
-            rest = _rest_of_tests(model.problem, alone, check)
+            simpler = settled(_raised(problem, alone), check)
+            rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
             if not any(test.contradicted for test in rest):
-                yield term, alone, rest
-
-
-def _rest_of_tests(problem: Problem, raised: Sequence[SizeTest],
-                   check: Callable[[TermEquations], None]) -> tuple[SizeTest, ...]:
-    """Return the tests of the other sizes if those of some terms are what the readings allow."""
-    simpler = settled(_raised(problem, raised), check)
-    names = {test.name for test in raised}
-    return _size_tests(simpler, [term for term in problem.terms if term.name not in names])
+                sizes = (*alone, *rest)
+                break
+    return replace(settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms)
 
 
 def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
