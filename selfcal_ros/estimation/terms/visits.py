@@ -351,14 +351,14 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
     return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
                       measurements.sense,
                       tuple(view.view.name for view in lines), measurements.artifact.angular_count,
-                      line_offsets_of(lines, measurements.artifact.angular_count),
+                      _line_offsets_of(lines, measurements.artifact.angular_count),
                       shared if len(shared) > 1 else (), placings,
                       tuple(view.plan_view for view in views),
                       np.array([view.cell_m for view in views]), measurements.artifact.field,
                       drift_degree, tuple(view.pose for view in views))
 
 
-def line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
+def _line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
     """Return the offset measured at each line, (views, lines), rad; 0 where not read.
 
     The stage stood at the nominal angle of each line up to what is the same for all of a view:
