@@ -103,7 +103,7 @@ class ReferenceLength:
     @property
     def name(self) -> str:
         """What was certified: the kind of the length, or its marks."""
-        if self.marks is None:
+        if not self.marks:
             return str(self.kind)
         return "distance of the marks {} and {}".format(*self.marks)
 

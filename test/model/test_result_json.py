@@ -255,3 +255,10 @@ def test_a_file_of_a_version_without_digests_is_not_qualified(older, tmp_path):
     assert found.verdict.reasons[0] == (
         "the file has no digests, so whether it was edited cannot be checked")
     np.testing.assert_array_equal(found.error_map.gx, before.error_map.gx)
+
+
+@pytest.mark.parametrize(("kind", "marks", "name"), [
+    ("stage_x", None, "stage_x"), ("artifact", (), "artifact"),
+    ("marks", ((-5, 0), (5, 0)), "distance of the marks (-5, 0) and (5, 0)")])
+def test_a_reference_is_named_by_its_kind_or_its_marks(kind, marks, name):
+    assert ReferenceLength(kind, 1e-6, marks=marks).name == name
