@@ -26,7 +26,7 @@ ALONE_S = 1.0
 """Time for which the publisher of a map must be alone before it is used: another one may be found
 later than a latched message."""
 MOST_WAITING = 20
-"""Messages that wait for that time; only the newest count."""
+"""Messages of a topic that wait for that time; of more the oldest are refused."""
 KEPT = "maps from the network are not used until one node alone publishes them"
 
 
@@ -48,7 +48,8 @@ class MapsOfOneNode:
                  inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]) -> None:
         self._node = node
         self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
-        self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque(maxlen=MOST_WAITING)
+        self._waiting: dict[str, deque[tuple[float, Callable[[], None]]]] = {
+            topic.name: deque() for topic, _ in inputs}
         self._rivals, self._rivals_s = "", 0.0  # last seen
         self._subscriptions: list[Any] = []
         self._subscribe()
@@ -73,7 +74,12 @@ class MapsOfOneNode:
         """Keep a message until its publisher has been alone for long enough."""
         if self._has_rivals():
             raise self._of_several(topic)
-        self._waiting.append((time.monotonic(), topic, partial(take, message)))
+        waiting = self._waiting[topic]
+        waiting.append((time.monotonic(), partial(take, message)))
+        if len(waiting) > MOST_WAITING:
+            waiting.popleft()
+            raise InputError(topic, f"a message is not used: more than {MOST_WAITING} within "
+                             f"{ALONE_S:g} s", "publish each map once")
 
     def _of_several(self, topic: str) -> InputError:
         return InputError(topic, f"a message is not used: {self._rivals}",
@@ -86,9 +92,10 @@ class MapsOfOneNode:
         if not self._rivals:
             self._node.say(Level.WARN, f"{rivals}: {KEPT}")
         self._rivals, self._rivals_s = rivals, time.monotonic()
-        while self._waiting:  # whose they are cannot be told either
-            _, topic, _ = self._waiting.popleft()
-            self._node.refusals.add(topic, self._of_several(topic))
+        for topic, waiting in self._waiting.items():  # whose they are cannot be told either
+            while waiting:
+                waiting.popleft()
+                self._node.refusals.add(topic, self._of_several(topic))
         return True
 
     def _look(self) -> None:
@@ -101,9 +108,10 @@ class MapsOfOneNode:
             self._node.say(Level.OK, "one node alone publishes maps again: they are used")
             self.close()
             self._subscribe()
-        while self._waiting and now_s - self._waiting[0][0] >= ALONE_S:
-            _, _, take = self._waiting.popleft()
-            take()
+        for waiting in self._waiting.values():
+            while waiting and now_s - waiting[0][0] >= ALONE_S:
+                _, take = waiting.popleft()
+                take()
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):

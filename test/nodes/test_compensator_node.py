@@ -29,6 +29,11 @@ BENCH = Path(__file__).parents[1] / "bench" / "compensate.py"
 PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.09, -1.0)]
 
 
+def summary():
+    return fill(names.SUMMARY.type(), {"header": from_model.header(1, "stage"), "qualified": True,
+                                       "views_done": 4, "views_planned": 4})
+
+
 def latch_map(graph, error_map=MAP) -> None:
     publisher = graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name,
                                             names.ERROR_MAP.qos)
@@ -36,9 +41,7 @@ def latch_map(graph, error_map=MAP) -> None:
         result_of(error_map), 1, "stage")))
     summaries = graph.hand.create_publisher(names.SUMMARY.type, names.SUMMARY.name,
                                             names.SUMMARY.qos)
-    summaries.publish(fill(names.SUMMARY.type(), {
-        "header": from_model.header(1, "stage"), "qualified": True, "views_done": 4,
-        "views_planned": 4}))
+    summaries.publish(summary())
 
 
 def map_file(folder) -> str:
@@ -255,11 +258,27 @@ def test_a_map_that_waits_when_a_second_node_is_found_is_counted(graph, monkeypa
     monkeypatch.setattr(names, "rivals", lambda node, topics: "")
     node = graph.node(CompensatorNode)
     latch_map(graph)
-    graph.until(lambda: len(node._maps._waiting) == 2, "map and summary")
+    graph.until(lambda: all(node._maps._waiting.values()), "map and summary")
     monkeypatch.setattr(names, "rivals", lambda node, topics: "two nodes publish")
     graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] == 1, "the refusal")
-    assert node.refusals.counts[names.SUMMARY.name] == 1 and not node._maps._waiting
+    assert node.refusals.counts[names.SUMMARY.name] == 1 and not any(node._maps._waiting.values())
     assert node.session.compensator is None
+
+
+def test_many_summaries_take_no_map_away_and_the_oldest_are_counted(graph, monkeypatch):
+    monkeypatch.setattr(compensator, "ALONE_S", PATIENCE_S)
+    node = graph.node(CompensatorNode)
+    latch_map(graph)
+    graph.until(lambda: all(node._maps._waiting.values()), "map and summary")
+    summaries, more = graph.publisher(names.SUMMARY), compensator.MOST_WAITING + 2
+    for number in range(1, more + 1):
+        summaries.publish(summary())
+        graph.until(lambda number=number: node.refusals.counts[names.SUMMARY.name] + len(
+            node._maps._waiting[names.SUMMARY.name]) == number + 1, f"summary {number}")
+    assert node.refusals.counts[names.SUMMARY.name] == 3
+    assert len(node._maps._waiting[names.ERROR_MAP.name]) == 1
+    monkeypatch.setattr(compensator, "ALONE_S", 0.0)
+    graph.until(lambda: node.session.compensator is not None, "the map")
 
 
 def test_a_malformed_map_does_not_end_the_node(graph):
