@@ -37,6 +37,30 @@ Pair = tuple[Axis, Axis]
 """Axis whose position selects an entry, and axis that is corrected."""
 
 
+def leaves_too_much(left: tuple[float, float], before: tuple[float, float], u: float, *,
+                    rounding: float = 0.0) -> bool:
+    """Tell whether more is left of an error than U, or 5 % of it.
+
+    Parameters
+    ----------
+    left, before : (float, float)
+        What a table leaves of the error, and the error, m or rad: rms and largest.
+    u : float
+        Standard uncertainty of the error, rms. U is 2 u, and 4 u at one node.
+    rounding : float
+        What the digits of a table leave.
+    """
+    return any(rest > max(LEFT_OF_A_MAP * size, limit * u, rounding)
+               for rest, size, limit in zip(left, before, (2, 4), strict=True))
+
+
+def known_rms(*u: np.ndarray) -> float:
+    """Return the root mean square of the vectors of u where it is known, else 0."""
+    squares = np.sum(np.square(u), axis=0)
+    known = squares[np.isfinite(squares)]
+    return float(np.sqrt(known.mean())) if known.size else 0.0
+
+
 @dataclass(frozen=True)
 class OneAxisPart:
     """A part of a map that 1D tables can correct, and what is left of it.
@@ -63,9 +87,8 @@ class OneAxisPart:
     @property
     def unfit(self) -> bool:
         """Whether more is left than U (k = 2, rms; twice U at one node) and 5 % of the part."""
-        return any(left > max(LEFT_OF_A_MAP * size, limit * self.u, ROUNDED_M)
-                   for left, size, limit in ((self.rms_left, self.rms, 2),
-                                             (self.largest_left, self.largest, 4)))
+        return leaves_too_much((self.rms_left, self.largest_left), (self.rms, self.largest),
+                               self.u, rounding=ROUNDED_M)
 
 
 @dataclass(frozen=True)
@@ -143,7 +166,7 @@ class _PairOfAxes:
     def __init__(self, whole: ErrorMap, tables: list[Table1D], pair: Pair, *,
                  frame: MachineFrame, setup: MachineSetup) -> None:
         self.pair = pair
-        self.u = _known_rms(whole.u_gx if pair[1] == "x" else whole.u_gy)
+        self.u = known_rms(whole.u_gx if pair[1] == "x" else whole.u_gy)
         bound = [bound_1d(table, setup) for table in tables]
         slopes, shapes = zip(*(_makes(table) for table in bound), strict=True)
         self.has_slope, self.has_shape = any(slopes), any(shapes)
@@ -270,8 +293,3 @@ def _slope(position: np.ndarray, values: np.ndarray) -> float:
     from_middle = position - position.mean()
     square = from_middle @ from_middle
     return float(from_middle @ values / square) if square else 0.0
-
-
-def _known_rms(u: np.ndarray) -> float:
-    known = u[np.isfinite(u)]
-    return rms(known) if known.size else 0.0

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup, bound_2d
 from selfcal_ros.aerotech.export import UNIFORM
 from selfcal_ros.aerotech.model import CalFile, Table, Table1D, Table2D
-from selfcal_ros.aerotech.one_axis import LEFT_OF_A_MAP, OneAxisFit, one_axis_fit
+from selfcal_ros.aerotech.one_axis import OneAxisFit, known_rms, leaves_too_much, one_axis_fit
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.export import fill_unknown
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
@@ -97,16 +97,16 @@ class TableVerification:
         """Return the residuals of tables that are not those of a map, though no worse than none.
 
         Of a 2D table and of a theta table no more than U of the map (k = 2) may remain, rms, and
-        at no place more than twice U, or `LEFT_OF_A_MAP` of the error. 1D tables of x and y are
+        at no place more than twice U, or 5 % of the error. 1D tables of x and y are
         judged by `one_axis`.
         """
         in_two_axes = self.sites if self.one_axis is None else None
         pairs = ((in_two_axes, (error_map.u_gx, error_map.u_gy)),
                  (self.entries, (error_map.u_gx, error_map.u_gy)),
                  (self.lines, (error_map.u_g_theta,)))
-        found = [residual for residual, u in pairs if residual is not None and any(
-            size("after") > max(LEFT_OF_A_MAP * size("before"), limit * _rms_of(u))
-            for size, limit in ((residual.rms, 2), (residual.largest, 4)))]
+        found = [residual for residual, u in pairs if residual is not None and leaves_too_much(
+            (residual.rms("after"), residual.largest("after")),
+            (residual.rms("before"), residual.largest("before")), known_rms(*u))]
         return [residual for residual in found
                 if residual is not self.entries or self.sites not in found]
 
@@ -117,13 +117,6 @@ def _without_turn(position: np.ndarray, residual: np.ndarray) -> np.ndarray:
     turn = np.stack([-y, x])
     square = (turn**2).sum()
     return residual - turn * ((turn * residual).sum() / square if square else 0.0)
-
-
-def _rms_of(u: Sequence[np.ndarray]) -> float:
-    """Return the root mean square of the vectors of u where it is known, else 0."""
-    squares = np.sum(np.square(u), axis=0)
-    known = squares[np.isfinite(squares)]
-    return float(np.sqrt(known.mean())) if known.size else 0.0
 
 
 def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
