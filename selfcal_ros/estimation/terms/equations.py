@@ -602,9 +602,12 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
         root = root_of(rest, columns.rows([name]))
         rest = rest - root @ root.T
         out.append((str(name), root))
-    own = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(rest / np.outer(own, own))
-    out.append((FREE, own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
+    free = np.isinf(columns.size)
+    own = np.sqrt(np.maximum(np.diag(covariance)[free], np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(rest[np.ix_(free, free)] / np.outer(own, own))
+    root = np.zeros((len(free), len(own)))
+    root[free] = own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    out.append((FREE, root))
     return out
 
 
