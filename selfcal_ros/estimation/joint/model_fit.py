@@ -182,7 +182,7 @@ class _State:
         self.y = problem.grid.y
         self.found = fit(problem, self.y, self.theta)
         self.offset_steps = LATE
-        self.moved_m, self.changed_m = np.zeros(problem.system.size), 0.0
+        self.moved_m, self.changed = np.zeros(problem.system.size), np.zeros_like(self.y)
         self.fell = self.rounds = False
         self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
@@ -190,7 +190,7 @@ class _State:
             ground = without_noise(problem.ground, self.found.residuals)
             self._linearise(term_columns(ground, problem.terms))
         equations = self.equations
-        self.coefficients = np.zeros(equations.n if equations else 0)
+        self.coefficients = self.stepped = np.zeros(equations.n if equations else 0)
 
     def _linearise(self, columns: TermColumns) -> None:
         """Set up the equations of the terms about the present solution."""
@@ -232,7 +232,7 @@ class _State:
         on them: all rotations together, that of a view of lines alone. What is taken off the
         readings may where the misalignments take it up; not so what places of the stage change.
         """
-        parameters, y = self.found.parameters, self.y
+        parameters, y, coefficients = self.found.parameters, self.y, self.coefficients
         if self.equations is not None:
             self._refresh(self.equations)
         self.steps += 1
@@ -245,14 +245,16 @@ class _State:
                           - self._of_terms() - taken, 0.0)
         self.found = fit(self.problem, self.y, self.theta)
         self.moved_m = np.abs(self.found.parameters - parameters)
-        self.changed_m = float(np.abs(self.y - y).max())
-        return max(min(float(self.moved_m.max()), self.changed_m), self.moving.change)
+        self.changed, self.stepped = self.y - y, self.coefficients - coefficients
+        return max(min(float(self.moved_m.max()), float(np.abs(self.changed).max())),
+                   self.moving.change)
 
     def within_noise(self, part: float) -> bool:
         """Return whether the last step was below a part of what the noise makes of it.
 
-        Of a misalignment that the readings alone determine that is its standard uncertainty; of one
-        that the datum fixes, and of a reading, that of the mean of all readings of a view.
+        Of a misalignment that the readings alone determine, and of a coefficient, that is its
+        standard uncertainty; of a misalignment that the datum fixes, and of what else is taken off
+        a reading, that of the mean of all readings of a view.
         """
         sigma, weight = self.found.xy.sigma, self.problem.grid.weight
         if not np.isfinite(sigma):
@@ -261,8 +263,21 @@ class _State:
         spread = np.diag(self.found.inverse)
         told = spread > ROUNDED * spread.max(initial=0.0)
         noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
-        still = bool((self.moved_m <= part * noise).all()) or self.changed_m <= part * of_view
+        still = bool((self.moved_m <= part * noise).all()) or (
+            self._changed_besides_m <= part * of_view and self._terms_are_still(part * sigma))
         return still and self.moving.change <= part * of_view
+
+    @property
+    def _changed_besides_m(self) -> float:
+        """The largest change of a reading in the last step besides that of the terms, m."""
+        return float(np.abs(self.changed + self._of_terms(by=self.stepped)).max())
+
+    def _terms_are_still(self, part_m: float) -> bool:
+        """Return whether the last step of each coefficient was below a part of its noise."""
+        if self.equations is None:
+            return True
+        variances = np.diag(self.equations.inverse(self.found.xy.sigma))
+        return bool((np.abs(self.stepped) <= part_m * np.sqrt(variances)).all())
 
     def finished(self) -> ModelFit:
         if self.equations is not None and self._stale(self.equations):
@@ -309,12 +324,17 @@ class _State:
             self.fell |= sigma_m < before[0]
         return self.rounds
 
-    def _of_terms(self, trait: Callable[[Block], bool] = lambda block: True) -> np.ndarray | float:
-        """Return the effect of the terms with a trait on the readings, (views, nx, ny), m."""
+    def _of_terms(self, trait: Callable[[Block], bool] = lambda block: True,
+                  by: np.ndarray | None = None) -> np.ndarray | float:
+        """Return the effect of the terms with a trait on the readings, (views, nx, ny), m.
+
+        Of their coefficients, or of other ones.
+        """
         if self.equations is None:
             return 0.0
         columns = self.equations.columns
-        return columns.shapes.combined(self.coefficients, columns.having(trait))
+        return columns.shapes.combined(self.coefficients if by is None else by,
+                                       columns.having(trait))
 
     def _excess(self) -> np.ndarray | float:
         """Return `Problem.excess` of the present solution."""

@@ -99,7 +99,8 @@ def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
             step(state)
             change = changes(len(steps))
             steps.append(change)
-            state.moved_m, state.changed_m = np.full(state.problem.system.size, change), change
+            state.moved_m = np.full(state.problem.system.size, change)
+            state.changed = np.full_like(state.y, change)
             return change
         monkeypatch.setattr(model_fit._State, "step", told)
         return fit_model(problem)
