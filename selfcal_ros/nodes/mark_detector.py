@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message
 
 from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import BEAT_S
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import WhileConfigured
 from selfcal_ros.nodes.names import MatchedInput
@@ -50,6 +51,7 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         images = ByTheClock(topics[0].name, self.guarded(self._take, topics[0].name), lambda: None)
         self._input = MatchedInput(self, topics, images, raw=True)
         self.every(TICK_S, self._look)
+        self.every(BEAT_S, self._tell_taken)
         self._tell_taken()
 
     def _publish(self, _output: str, fields: dict[str, Any]) -> None:

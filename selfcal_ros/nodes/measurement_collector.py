@@ -13,6 +13,7 @@ from selfcal_ros.collection.collector import keep_freed_memory
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
+from selfcal_ros.nodes.base import BEAT_S
 from selfcal_ros.nodes.managed import WhileConfigured, stop
 from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
@@ -96,8 +97,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._busy = self.at_need(BUSY_S, self._on_timer)
         self._soon = self.at_need(SOON_S, self._on_soon)
         self.service(Trigger, "~/finish", lambda request: self._finish())
-        if not self._reception.restoring:
-            self._tell_received()
+        self.every(BEAT_S, self._tell_received)
+        self._tell_received()
 
     def _publish(self, output: str, fields: dict[str, Any]) -> None:
         self._outputs[output](fields)
@@ -132,6 +133,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         return count
 
     def _tell_received(self) -> None:
+        if self._reception.restoring:
+            return
         self._received.publish(names.RECEIVED.type(
             data=list(self.session.collector.received.values())))
 

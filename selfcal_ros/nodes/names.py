@@ -78,7 +78,8 @@ DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, _qos(100, reliable=False))
 HEALTH = Topic("health", DiagnosticStatus, _qos(1, latched=True))
 RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
 """The collector's counts of encoder samples, detections and commands, or the detector's of images
-taken, detections published and subscriptions connected to these, for a player's pace."""
+taken, detections published and subscriptions connected to these, for a player's pace. Told again
+with each beat: a player that missed the only one would wait for ever."""
 SOLVED = Topic("solved", String, _qos(1, latched=True))
 """The solver's fingerprint of the readings behind its results."""
 
