@@ -139,11 +139,18 @@ class LatticeViews:
         out *= self.phases.conj()[:, None, None]
         return out
 
+    @cached_property
+    def _mark_on(self) -> np.ndarray:
+        """Flat index of the one mark on every site in each view, int (views, nx, ny); -1 = none."""
+        out = np.full((len(self.poses), self.shape[0] * self.shape[1]), -1)
+        for mark_on, site in zip(out, self.site_index.reshape(out.shape), strict=True):
+            here = np.flatnonzero(site >= 0)
+            mark_on[site[here]] = here
+        return out.reshape(-1, *self.shape)
+
     def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
         """Add the scatter of one view's fields over the marks to `out`, (..., nx, ny) both."""
-        here = self.in_field[index]  # of a view no two marks are at one site
-        i, j = np.unravel_index(self.site_index[index][here], self.shape)
-        out[..., i, j] += marks[..., here] * self.phases[index]
+        out += _taken(marks, self._mark_on[index]) * self.phases[index]
 
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: sums over views at every site, complex (..., nx, ny)."""

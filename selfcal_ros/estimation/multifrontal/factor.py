@@ -384,12 +384,7 @@ class Factor:
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution for one or more right-hand sides, (sites,) or (sites, k)."""
         folded, n = self.folded, self._n_free
-        turned = folded.phase.conj()[:, None] * right.reshape(len(right), -1)
-        work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
-        work[:n] = turned[folded.free[self.dissection.order]]
-        self._forward(work)
-        closed = turned[folded.cut]
-        np.add.at(closed, folded.copy_of, folded.copy_phase.conj()[:, None] * work[n:])
+        work, closed = self._eliminated(right.reshape(len(right), -1))
         closed = self._cut_inverse @ closed
         work[n:] = folded.copy_phase[:, None] * closed[folded.copy_of]
         self._backward(work)
@@ -398,6 +393,26 @@ class Factor:
         out[folded.cut] = closed
         out *= folded.phase[:, None]
         return out.reshape(right.shape)
+
+    def products(self, right: np.ndarray) -> np.ndarray:
+        """Return the inner products of right-hand sides (sites, k) with their solutions, (k, k).
+
+        With M = P^H L L^H P these are the products of L^-1 P: no back substitution.
+        """
+        work, closed = self._eliminated(right)
+        free = work[:self._n_free]
+        return free.conj().T @ free + closed.conj().T @ (self._cut_inverse @ closed)
+
+    def _eliminated(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return columns (sites, k) after elimination: for all variables, and for the cut sites."""
+        folded, n = self.folded, self._n_free
+        turned = folded.phase.conj()[:, None] * columns
+        work = np.zeros((folded.size, turned.shape[1]), dtype=complex)
+        work[:n] = turned[folded.free[self.dissection.order]]
+        self._forward(work)
+        closed = turned[folded.cut]
+        np.add.at(closed, folded.copy_of, folded.copy_phase.conj()[:, None] * work[n:])
+        return work, closed
 
     def _forward(self, work: np.ndarray) -> None:
         real = work.view(float)

@@ -396,6 +396,11 @@ class DenseFactor:
         """Return the solution for one or more right-hand sides, (n,) or (n, k)."""
         return lapack.zpotrs(self._lower, right, lower=1)[0].reshape(right.shape)
 
+    def products(self, right: np.ndarray) -> np.ndarray:
+        """Return the inner products of right-hand sides (n, k) with their solutions, (k, k)."""
+        half = lapack.ztrtrs(self._lower, right, lower=1)[0]
+        return half.conj().T @ half
+
     @cached_property
     def inverse(self) -> np.ndarray:
         """The inverse, complex (n, n)."""

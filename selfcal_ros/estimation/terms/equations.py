@@ -16,7 +16,7 @@ readings give another size: that at which b' (C + size^2 1)^-1 b equals its rank
 1982), and at most that at which it is improbably small.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -42,16 +42,19 @@ class ReducedColumns:
 
     Attributes
     ----------
+    grid : GridSystem
+        The measured plan.
     shapes : Shapes
         The columns, p of them, of q shapes.
     sites : complex array (sites, q)
-        M^-1 s of every shape, with s its right-hand side.
+        Right-hand side s of every shape.
     inner : complex array (q, q)
         Weighted inner products of the shapes' residuals after marks and sites.
     asked : complex array (2 views, q)
         Coupling of the shapes to rotation and offset of every view, sites eliminated.
     """
 
+    grid: GridSystem
     shapes: Shapes
     sites: np.ndarray
     inner: np.ndarray
@@ -60,7 +63,7 @@ class ReducedColumns:
     @cached_property
     def free(self) -> np.ndarray:
         """M^-1 s of every column, complex (sites, p)."""
-        return self.shapes.of_columns(self.sites)
+        return self.shapes.of_columns(self.grid.solve(self.sites))
 
     @cached_property
     def right(self) -> np.ndarray:
@@ -77,9 +80,8 @@ class ReducedColumns:
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     """Return columns with the sites eliminated; the last ones are kept."""
     sites, inner, asked = _marks_eliminated(grid, shapes)
-    solved = grid.solve(sites)
-    inner -= sites.conj().T @ solved
-    return ReducedColumns(shapes, solved, (inner + inner.conj().T) / 2,
+    inner -= grid.factor.products(sites)
+    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
                           asked - _coupled(grid, sites))
 
 
@@ -122,8 +124,8 @@ class ProjectedColumns:
 
     Attributes
     ----------
-    fields : complex array (sites, p)
-        Map F.
+    make_fields : callable
+        Returns `fields`, which only the last step needs.
     parameters : float array (size, p)
         Misalignments, as in `NormalEquations`.
     gram : float array (p, p)
@@ -132,10 +134,15 @@ class ProjectedColumns:
         Angular map of each column, sign reversed, rad.
     """
 
-    fields: np.ndarray
+    make_fields: Callable[[], np.ndarray]
     parameters: np.ndarray
     gram: np.ndarray
     turned: np.ndarray
+
+    @cached_property
+    def fields(self) -> np.ndarray:
+        """Map F, complex (sites, p)."""
+        return self.make_fields()
 
     def of_lines(self, system: NormalEquations, lines: LineColumns,
                  half_width_m: float) -> np.ndarray:
@@ -174,8 +181,8 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
     gram[np.ix_(lines.at, lines.at)] += ratio * half_width_m**2 * gram_of_lines
     turned = angular.response @ parameters[system.phi_at] / half_width_m
     turned[:, lines.at] -= free
-    return ProjectedColumns(reduced.free - system.grid.response @ parameters[:n], parameters,
-                            (gram + gram.T) / 2, turned)
+    return ProjectedColumns(lambda: reduced.free - system.grid.response @ parameters[:n],
+                            parameters, (gram + gram.T) / 2, turned)
 
 
 def lines_eliminated(angular: AngularSystem,

@@ -216,7 +216,7 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
     part = every.projected
     return TermEquations(
         every.system, TermColumns(columns, known.shapes.part(rows), within, known.at),
-        ProjectedColumns(part.fields[:, rows], part.parameters[:, rows],
+        ProjectedColumns(lambda: part.fields[:, rows], part.parameters[:, rows],
                          part.gram[np.ix_(rows, rows)], part.turned[:, rows]), every.noise_m)
 
 
