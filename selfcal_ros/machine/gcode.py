@@ -24,6 +24,8 @@ ALLOWANCE = 2.0
 PATIENCE_S = 5.0
 """The same for its acceleration, and for answers."""
 POLL_S = 0.02
+GREETING_S = 2.0
+"""Longest silence in the greeting of a board that was reset by opening its port."""
 HOLD_S = 0.3
 """Time from a feed hold to the reset: a reset during the motion loses the position."""
 MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
@@ -208,7 +210,7 @@ class _Grbl(_Talk):
         """Read the greeting away; a controller that was open before says nothing."""
         try:
             while True:
-                self._lines.receive(2.0)
+                self._lines.receive(GREETING_S)
         except MachineError as error:
             if "no answer" not in error.what:
                 raise

@@ -15,7 +15,15 @@ from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
 from test.support.firmware import FaultyGrbl, Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
 
 pytest.importorskip("serial")
+pytestmark = pytest.mark.usefixtures("quick_controllers")
 KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCnc}
+
+
+@pytest.fixture
+def quick_controllers(monkeypatch):
+    """Wait for controllers that greet, move and stop at once."""
+    for name in ("POLL_S", "GREETING_S", "HOLD_S"):
+        monkeypatch.setattr(gcode, name, getattr(gcode, name) / 20)
 
 
 @pytest.mark.parametrize(("dialect", "over"), [
@@ -92,7 +100,8 @@ def test_a_controller_that_fails_in_the_middle_of_a_view(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("over", [over_tcp, over_pty])
-def test_a_lost_connection_is_named(over):
+def test_a_lost_connection_is_named(over, monkeypatch):
+    monkeypatch.setattr(gcode, "PATIENCE_S", 0.3)
     firmware = Grbl()
     with over(firmware) as port:
         machine = GcodeMachine(port, "grbl", feed=6000.0)
