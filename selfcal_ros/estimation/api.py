@@ -134,23 +134,32 @@ def calibrate_corrected(measurements: Measurements, options: Options) -> Calibra
     return calibrate(readings, replace(options, plate=corrected(before)))
 
 
+BY_LINES = "sign_shown_by_lines"
+"""The finding that contradicts nothing: the readings agree, with both signs of all offsets."""
+
+
 def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
     of_repeats = {"sign_not_shown", "scale_of_offsets", "lines_sign_not_shown"}
-    failed = {found.name for found in verdict.failed}
+    failed = {found.name for found in verdict.failed} - {BY_LINES}
+    if verdict.failed and not failed:
+        return _fits(result)
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
 
 
 def _fits(result: CalibrationResult) -> bool:
     """Return whether nothing contradicts the wiring: no test failed, and lines turn as marks do.
 
+    That lines alone show the sign contradicts nothing.
+
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
     found = [(cause, block_of(cause.name)) for cause in result.verdict.causes
              if cause.name in blocks()]
-    return not result.verdict.failed and not any(
+    failed = {found.name for found in result.verdict.failed}
+    return failed <= {BY_LINES} and not any(
         block.between or abs(cause.size) > block.plausible for cause, block in found)
 
 

@@ -22,7 +22,7 @@ from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
 ARTIFACT = Artifact(11, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 20e-9, np.deg2rad(0.001)
 MODEL = Spread(encoder="independent", rotation="finite")
-SETTINGS = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=0.0,
+SETTINGS = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=20e-9,
                         servo_sigma_theta_rad=0.0)
 
 

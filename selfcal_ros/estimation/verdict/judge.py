@@ -29,7 +29,7 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
-from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
+from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, Problem, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -95,8 +95,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
         failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
     if not solved.converged:
         failed.append(Finding("not_converged"))
-    signs = _sign_findings(checked, measurements, options)
-    failed += [found for found in signs if found.name == "sign_not_shown"]
+    failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
     searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
     zero = {str(term.name) for term in options.terms if term.size == 0}
@@ -121,7 +120,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
         result, verdict=verdict,
-        findings=(*result.findings, *[found for found in signs if found not in failed],
+        findings=(*result.findings,
                   *_visits_findings(checked), *_views_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
@@ -204,15 +203,15 @@ def _sign_findings(solved: Solved, measurements: Measurements,
                    options: Options) -> list[Finding]:
     """Return a finding if nothing shows the sign of the offsets, or lines alone do.
 
-    Repeats show it, or the joint fit does (through rotations that lines share, and their squares),
-    or the microscope was declared. Lines share them with the other sign as well if it is that of
-    their own offsets, too.
+    Repeats show it, or the joint fit does (through where the stage stood beside its targets,
+    rotations that lines share, and their squares), or the microscope was declared. Lines share
+    rotations with the other sign as well if it is that of their own offsets, too.
     """
     seen = all(view.visits is not None for view in measurements.views if len(view.m))
     if _is_declared(options) or not seen or sign_is_shown(measurements):  # nothing can show it
         return []
     model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
-    if model is None or model.equations is None:
+    if model is None or model.equations is None or _stops_show_the_sign(model, measurements):
         return []
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)
@@ -235,6 +234,33 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     return [Finding("sign_shown_by_lines")]
 
 
+def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
+    """Return whether views agree less well if offsets and lines both have the other sign.
+
+    The stage stood s beside its targets, and y = s + o. All signs reversed, o - s is a reading as
+    good as s - o: a stage that stood on its targets has nothing to tell them apart by.
+    """
+    problem = replace(model.problem, terms=(), residuals_xy=None)
+    other = model.y.copy()
+    for row, (index, placed) in enumerate(zip(problem.grid.index, problem.ground.visits,
+                                              strict=True)):
+        visits = measurements.views[index].visits
+        if visits is None or placed is None:
+            continue
+        stood = visits.dx - visits.offset_x + 1j * (visits.dy - visits.offset_y)
+        means = placed.means((stood * placed.phase)[None], other[row].size)[0]
+        other[row] -= 2 * means.reshape(other[row].shape)
+    return _is_worse(model, (problem, model.y), (problem, other))
+
+
+def _is_worse(model: ModelFit, one: tuple[Problem, np.ndarray],
+              other: tuple[Problem, np.ndarray]) -> bool:
+    """Return whether other readings are far less likely than one, each with its problem."""
+    before, after = (squares(problem, fit(problem, y))[0] for problem, y in (one, other))
+    noise = max(model.found.xy.sigma, LEAST_NOISE_M)
+    return bool((after - before) / noise**2 > -2 * np.log(SHOWN))
+
+
 def _is_declared(options: Options) -> bool:
     """Return whether the microscope is declared, and with it the signs of the offsets."""
     return not options.assumed or any(
@@ -255,17 +281,15 @@ def _lines_sign_findings(solved: Solved, measurements: Measurements,
             or sign_of_lines_is_shown(measurements)):
         return []
     problem = replace(model.problem, terms=(), residuals_xy=None)
-    angular, squared = problem.angular, []
+    angular, read = problem.angular, []
     if not problem.system.angular.n_views:
         return []
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
     turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
     for sign in (1, -1):  # of the readings before they were turned into the frame of the plate
         y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
-        read = replace(problem, angular=replace(angular, y=y))
-        squared.append(squares(read, fit(read, model.y))[0])
-    worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
-    return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
+        read.append((replace(problem, angular=replace(angular, y=y)), model.y))
+    return [] if _is_worse(model, *read) else [Finding("lines_sign_not_shown")]
 
 
 def _scale_findings(solved: Solved, measurements: Measurements, options: Options,

@@ -26,7 +26,7 @@ def measured(factor, sense=Sense.MICROSCOPE_MOVES, *, spread=SPREAD, plan=None, 
     """Return a machine whose published offsets of lines are `factor` times the true ones."""
     plan, rng = plan or hu_plan(ARTIFACT, 4), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng, replace(spread, line_factor=factor))
-    settings = CellSettings(sense, 2e-8, 2e-6, servo_sigma_m=0.0, **how)
+    settings = CellSettings(sense, 2e-8, 2e-6, **{"servo_sigma_m": 0.0} | how)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
@@ -81,7 +81,8 @@ def test_check_stops_tell_the_lines_from_the_microscope(factor):
 
 @pytest.mark.parametrize("spread", [replace(SPREAD, microscope_scale=0.06), SPREAD])
 def test_without_them_either_may_be_at_fault(spread):
-    truth, readings = measured(1.0 if spread.microscope_scale else 1 / 0.94, spread=spread)
+    truth, readings = measured(1.0 if spread.microscope_scale else 1 / 0.94, spread=spread,
+                               servo_sigma_m=5e-9)
     result = worded(calibrate(readings, Options()))
     microscope, lines = result.verdict.causes
     assert (microscope.name, lines.name) == ("microscope", "line_scale")

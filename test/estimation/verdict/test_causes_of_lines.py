@@ -32,8 +32,8 @@ FINE_RAD, COARSE_RAD = 2e-7, 2e-5
 def truth_and_readings(seed, sigma_rad, *, repeats=2, spread=None, **how):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
-    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad, servo_sigma_m=0.0,
-                            servo_sigma_theta_rad=0.0, **how)
+    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad,
+                            **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0} | how)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
@@ -94,7 +94,8 @@ SCALES = ["microscope", "line_scale"]
     (replace(ASKEW, plate_strain=2e-6), 0.0, ["plate_strain"], Sense.PLATE_MOVES)])
 def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(spread, by_rad, names, sense):
     """No size grows for a turn of lines, and no turn of lines is named where a size is wrong."""
-    truth, readings = truth_and_readings(5, FINE_RAD, spread=spread, sense=sense)
+    truth, readings = truth_and_readings(5, FINE_RAD, spread=spread, sense=sense,
+                                         servo_sigma_m=2e-8)
     result = calibrate(turned(readings, 3, by_rad), Options())
     told = names != ["plate_strain"]  # Hu's views do not determine two of its modes
     assert result.verdict.grade is (Grade.ENLARGED if told else Grade.NOT_QUALIFIED)
@@ -122,7 +123,7 @@ def test_without_an_uncertainty_it_cannot_be_said_to_be_harmless():
 @pytest.mark.parametrize("options", [BARE, Options(), apart(np.inf), apart(1e-2)],
                          ids=["bare", "assumed", "free", "declared"])
 def test_offsets_of_lines_with_the_other_sign_are_no_bent_plate(options):
-    readings = measured(3, COARSE_RAD)
+    readings = measured(3, COARSE_RAD, servo_sigma_m=2e-8)
     wrong = replace(readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views))
     assert calibrate(readings, options).verdict.grade is Grade.GOOD
     with pytest.raises(WiringError, match="offset_theta has the other sign"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.checks.wiring import WiringError
+from selfcal_ros.estimation.checks.wiring import Turned, WiringError, turned_readings
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict import search
@@ -109,11 +109,15 @@ def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(readings
     assert searched == [True]
 
 
-def offsets_of(stop_sigma_m, servo_sigma_theta_rad, phi_rad=1e-7):
+REVERSED = Turned(-np.eye(2), -1, "all signs are opposite")
+
+
+def offsets_of(stop_sigma_m, servo_sigma_theta_rad, phi_rad=1e-7, repeats=5,
+               sense=Sense.MICROSCOPE_MOVES):
     """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
-    plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), repeats), np.random.default_rng(3)
     spread = Spread(encoder="independent", rotation="finite", phi_rad=phi_rad)
-    settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
+    settings = CellSettings(sense, sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                             servo_sigma_theta_rad=servo_sigma_theta_rad,
                             stop_sigma_m=stop_sigma_m)
     return simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
@@ -132,16 +136,27 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
     assert verdict.grade is (Grade.NOT_QUALIFIED if asked else Grade.GOOD)
 
 
-@pytest.mark.parametrize(("scatter", "by_lines"), [
-    ((0.0, 0.0), True), ((20e-6, 0.0), False), ((0.0, 1e-4), False)])
-def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(scatter, by_lines):
-    """Marks and lines turn alike with both signs opposite: nothing contradicts that."""
-    readings = offsets_of(*scatter, phi_rad=1e-3)
-    result = calibrate(readings, Options())
-    assert result.verdict.grade is Grade.GOOD
-    assert ("sign_shown_by_lines" in [found.name for found in result.findings]) is by_lines
+@pytest.mark.parametrize(("scatter", "repeats", "by_lines"), [
+    ((0.0, 0.0), 5, True), ((20e-6, 0.0), 5, False), ((0.0, 1e-4), 5, False),
+    ((20e-9, 0.0), 1, False)])
+@pytest.mark.parametrize("sense", Sense)
+def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(scatter, repeats, by_lines,
+                                                                      sense):
+    """Marks and lines turn alike with both signs opposite: nothing contradicts that.
+
+    A stage that stands beside its targets contradicts it, in one visit of each mark as well.
+    """
+    readings = offsets_of(*scatter, phi_rad=1e-3, repeats=repeats, sense=sense)
+    asked = ["sign_shown_by_lines"] * by_lines
+    assert [found.name for found in calibrate(readings, Options()).verdict.failed] == asked
     declared = calibrate(readings, Options(terms=parse_terms(["microscope:1e-2"], "")))
-    assert "sign_shown_by_lines" not in [found.name for found in declared.findings]
+    assert declared.verdict.grade is Grade.GOOD
+    reversed_all = turned_readings(readings, REVERSED)
+    if by_lines or repeats == 1:
+        assert not calibrate(reversed_all, Options()).verdict.qualified
+    else:
+        with pytest.raises(WiringError, match="offsets of the other sign"):
+            calibrate(reversed_all, Options())
 
 
 @pytest.mark.parametrize("sense", Sense)

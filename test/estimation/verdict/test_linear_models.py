@@ -96,14 +96,17 @@ def test_a_linear_model_assumes_nothing(method):
 
 @METHODS
 def test_a_linear_model_asks_for_the_sign_of_the_offsets(method):
-    """By the scatter of the stage, by finite rotations, or nobody knows it."""
+    """By the scatter of the stage, or nobody knows it: rotations show it with lines alone."""
     linear = Options(misalignment_model="linear")
     verdict = judged(method, linear)[1].verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
     assert all("shows the sign of " in reason for reason in verdict.reasons)
     scatter = {"servo_sigma_m": 1e-7, "servo_sigma_theta_rad": 1e-4}
     assert judged(method, linear, **scatter)[1].verdict.grade is Grade.GOOD
-    assert judged(method, linear, replace(FLAT, phi_rad=3e-4))[1].verdict.grade is Grade.GOOD
+    turned = judged(method, linear, replace(FLAT, phi_rad=3e-4))[1].verdict
+    assert [found.name for found in turned.failed] == ["sign_shown_by_lines"]
+    stood = judged(method, linear, replace(FLAT, phi_rad=3e-4), servo_sigma_m=1e-8)[1].verdict
+    assert stood.grade is Grade.GOOD
 
 
 @METHODS

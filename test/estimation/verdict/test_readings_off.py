@@ -14,6 +14,7 @@ from selfcal_ros.estimation.verdict.causes import MOST, reading_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.simulation.cell import CellSettings
 from test.support.options import BARE
 from test.support.results import covered
 from test.support.truth import hu_plan, random_truth, simulate_measurements
@@ -25,8 +26,11 @@ SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 def truth_and_readings(seed, *, repeats=1, visits=True):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng)
+    stands = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=1e-7,
+                          servo_sigma_theta_rad=0.0)
     return truth, simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M,
-                                        sigma_theta_rad=SIGMA_RAD, visits=visits)
+                                        sigma_theta_rad=SIGMA_RAD,
+                                        settings=stands if visits else None)
 
 
 def measured(seed, **how):
