@@ -69,3 +69,19 @@ def pytest_collection_finish():
     gc.freeze()
     gc.set_threshold(*RARELY)
     gc.enable()
+
+
+@pytest.fixture
+def jumping_clocks(monkeypatch):
+    """Let the clocks of runs on machines jump ahead where they would wait.
+
+    Each jump is seen by all of them: a bag that is resumed does not lie in the future.
+    """
+    from selfcal_ros.machine.clock import Clock
+    from selfcal_ros.units import NS_PER_S
+
+    jumps_ns = []
+    now_ns = Clock.now_ns
+    monkeypatch.setattr(Clock, "now_ns", lambda self: now_ns(self) + sum(jumps_ns))
+    monkeypatch.setattr(
+        Clock, "sleep", lambda self, seconds: jumps_ns.append(round(seconds * NS_PER_S)))

@@ -18,6 +18,7 @@ from test.support.terminals import SELFCAL
 LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 
 
+@pytest.mark.usefixtures("jumping_clocks")
 def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     _, machine = write_cell(tmp_path, plan=LINES)

@@ -27,7 +27,7 @@ def new(*options):
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
+def elsewhere(tmp_path, monkeypatch, jumping_clocks):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plan_new, "best_plan", SEARCHED)
 

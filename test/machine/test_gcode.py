@@ -20,7 +20,7 @@ KINDS = {"grbl": Grbl, "marlin": Marlin, "klipper": Klipper, "linuxcnc": LinuxCn
 
 
 @pytest.fixture
-def quick_controllers(monkeypatch):
+def quick_controllers(monkeypatch, jumping_clocks):
     """Wait for controllers that greet, move and stop at once."""
     for name in ("POLL_S", "GREETING_S", "HOLD_S"):
         monkeypatch.setattr(gcode, name, getattr(gcode, name) / 20)

@@ -52,7 +52,7 @@ def test_commands_are_understood(page):
 
 
 @pytest.fixture
-def desk(tmp_path, monkeypatch):
+def desk(tmp_path, monkeypatch, jumping_clocks):
     """Go to a folder with what the repository has at its root, and a result."""
     for name in ("config", "bags", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
