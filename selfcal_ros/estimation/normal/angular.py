@@ -80,6 +80,11 @@ class AngularSystem(PlateEliminated):
         unit = identity(self.n_lines, format="csr")
         return tuple(unit[site] for site in self.site)
 
+    @cached_property
+    def _columns(self) -> tuple[csr_matrix | np.ndarray, ...]:
+        """The transposed rows."""
+        return tuple(rows.T for rows in self.rows)
+
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return maps (..., K) at the plate lines in each view, (..., views, K)."""
         flat = field.reshape(math.prod(field.shape[:-1]), self.n_lines).T
@@ -91,8 +96,8 @@ class AngularSystem(PlateEliminated):
     def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sums of readings (k, views, K) at the lines, (K, k), and of views, (views, k)."""
         sites = np.zeros((self.n_lines, len(readings)))
-        for rows, view in zip(self.rows, readings.transpose(1, 2, 0), strict=True):
-            sites += rows.T @ view
+        for columns, view in zip(self._columns, readings.transpose(1, 2, 0), strict=True):
+            sites += columns @ view
         return sites, readings.sum(axis=-1).T
 
     def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
