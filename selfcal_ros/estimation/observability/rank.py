@@ -55,13 +55,19 @@ def identifies(artifact: Artifact, views: Sequence[View]) -> bool:
     For searches: no advice, no matrix if the count of components already says no, and that of the
     middle of a large field if it determines all misalignments.
     """
+    return _identifies(artifact, tuple(views))
+
+
+@lru_cache
+def _identifies(artifact: Artifact, views: tuple[View, ...]) -> bool:
+    """Tell it once: every fit of readings of which some are missing asks for the same views."""
     system = planned_system(artifact, views)
     if artifact.map_grid is not None:
         return _nodes_known(system)
     parts = system.grid.components
     if parts.balanced.any() or min(parts.of_site.min(), parts.of_mark.min()) < 0:
         return False
-    middle = smaller(Plan("", artifact, tuple(views)), FULL_SIZE)
+    middle = smaller(Plan("", artifact, views), FULL_SIZE)
     if middle.artifact != artifact and not deficiency(planned_system(middle.artifact, views)):
         return True  # further readings can only add
     return deficiency(system) == 0
