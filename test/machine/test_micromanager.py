@@ -29,6 +29,7 @@ def config(tmp_path):
     return str(tmp_path / "demo.cfg")
 
 
+@pytest.mark.usefixtures("jumping_clocks")
 def test_the_example_finds_the_map_within_its_uncertainty(tmp_path, config):
     with_values(tmp_path / "cell.yaml", "detector", {"pixel_size": 1e-6, "turn": 3.0}, {})
     cell = read_cell(tmp_path / "cell.yaml")

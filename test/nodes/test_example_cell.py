@@ -39,6 +39,7 @@ def away_from(machine, gx, gy, size: int) -> tuple[np.ndarray, float]:
 SMALL = EXAMPLES.parent / "config/plans/small.yaml"
 
 
+@pytest.mark.usefixtures("jumping_clocks")
 @pytest.mark.parametrize(("plan", "cell", "size", "most"), [
     (SMALL, "cell", 5, 2e-8), (EXAMPLES / "camera_plan.yaml", "camera_cell", 3, 1e-7)])
 def test_an_example_is_measured_without_ros(tmp_path, monkeypatch, plan, cell, size, most):
