@@ -15,10 +15,10 @@ from test.support.cells import CELL, PLAN, write_cell
 from test.support.power_cuts import Cut, detections, measured, outcome, prepare
 from test.support.terminals import SELFCAL
 
+pytestmark = pytest.mark.usefixtures("jumping_clocks")
 LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 
 
-@pytest.mark.usefixtures("jumping_clocks")
 def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     _, machine = write_cell(tmp_path, plan=LINES)
