@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, ndtri
 
 from selfcal_ros import __version__
 from selfcal_ros.blocks import blocks
@@ -29,7 +29,7 @@ from selfcal_ros.estimation.checks.wiring import (
 )
 from selfcal_ros.estimation.datum.covariance import USUAL_LEVEL
 from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, squares
-from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, Problem, fit
+from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.options import Options
@@ -235,30 +235,32 @@ def _sign_findings(solved: Solved, measurements: Measurements,
 
 
 def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
-    """Return whether views agree less well if offsets and lines both have the other sign.
+    """Return whether views show by what the stage stood beside its targets the sign of offsets.
 
-    The stage stood s beside its targets, and y = s + o. All signs reversed, o - s is a reading as
-    good as s - o: a stage that stood on its targets has nothing to tell them apart by.
+    It stood s beside them, and y = s + o. If s is motion, true offsets undo it; offsets of the
+    other sign double it; noise of the encoders is left as it is. With Q(k) the squares of what
+    y - k s leaves, k = 1 - (Q(2) - Q(0)) / 4a is near 0, 2 and 1, its variance sigma^2 / a with
+    a = (Q(0) + Q(2)) / 2 - Q(1). It has to be nearer to 0 than to 1. All signs reversed, o - s is
+    a reading as good as s - o: a stage that stood on its targets has nothing to tell them apart by.
     """
     problem = replace(model.problem, terms=(), residuals_xy=None)
-    other = model.y.copy()
+    stood = np.zeros_like(model.y)
     for row, (index, placed) in enumerate(zip(problem.grid.index, problem.ground.visits,
                                               strict=True)):
         visits = measurements.views[index].visits
         if visits is None or placed is None:
             continue
-        stood = visits.dx - visits.offset_x + 1j * (visits.dy - visits.offset_y)
-        means = placed.means((stood * placed.phase)[None], other[row].size)[0]
-        other[row] -= 2 * means.reshape(other[row].shape)
-    return _is_worse(model, (problem, model.y), (problem, other))
-
-
-def _is_worse(model: ModelFit, one: tuple[Problem, np.ndarray],
-              other: tuple[Problem, np.ndarray]) -> bool:
-    """Return whether other readings are far less likely than one, each with its problem."""
-    before, after = (squares(problem, fit(problem, y))[0] for problem, y in (one, other))
+        beside = visits.dx - visits.offset_x + 1j * (visits.dy - visits.offset_y)
+        means = placed.means((beside * placed.phase)[None], stood[row].size)[0]
+        stood[row] = means.reshape(stood[row].shape)
+    with_it, halfway, without = (
+        squares(problem, fit(problem, model.y - k * stood))[0] for k in range(3))
     noise = max(model.found.xy.sigma, LEAST_NOISE_M)
-    return bool((after - before) / noise**2 > -2 * np.log(SHOWN))
+    information = (with_it + without) / 2 - halfway
+    if not information > noise**2:
+        return False
+    undone = (without - with_it) / (4 * information)
+    return bool(undone > max(0.5, -ndtri(SHOWN) * noise / np.sqrt(information)))
 
 
 def _is_declared(options: Options) -> bool:
@@ -281,15 +283,17 @@ def _lines_sign_findings(solved: Solved, measurements: Measurements,
             or sign_of_lines_is_shown(measurements)):
         return []
     problem = replace(model.problem, terms=(), residuals_xy=None)
-    angular, read = problem.angular, []
+    angular, squared = problem.angular, []
     if not problem.system.angular.n_views:
         return []
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
     turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
     for sign in (1, -1):  # of the readings before they were turned into the frame of the plate
         y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
-        read.append((replace(problem, angular=replace(angular, y=y)), model.y))
-    return [] if _is_worse(model, *read) else [Finding("lines_sign_not_shown")]
+        read = replace(problem, angular=replace(angular, y=y))
+        squared.append(squares(read, fit(read, model.y))[0])
+    worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
+    return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
 
 
 def _scale_findings(solved: Solved, measurements: Measurements, options: Options,

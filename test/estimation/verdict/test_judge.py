@@ -113,13 +113,13 @@ REVERSED = Turned(-np.eye(2), -1, "all signs are opposite")
 
 
 def offsets_of(stop_sigma_m, servo_sigma_theta_rad, phi_rad=1e-7, repeats=5,
-               sense=Sense.MICROSCOPE_MOVES):
+               sense=Sense.MICROSCOPE_MOVES, seed=3, **how):
     """Return readings whose offsets have so much scatter, of plates that lie nearly straight."""
-    plan, rng = hu_plan(Artifact(7, 0.01, 24), repeats), np.random.default_rng(3)
+    plan, rng = hu_plan(Artifact(7, 0.01, 24), repeats), np.random.default_rng(seed)
     spread = Spread(encoder="independent", rotation="finite", phi_rad=phi_rad)
     settings = CellSettings(sense, sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
                             servo_sigma_theta_rad=servo_sigma_theta_rad,
-                            stop_sigma_m=stop_sigma_m)
+                            stop_sigma_m=stop_sigma_m, **how)
     return simulate_measurements(random_truth(plan.artifact, 4, rng, spread), plan, rng,
                                  settings=settings, visits=True)
 
@@ -157,6 +157,17 @@ def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(scatter, r
     else:
         with pytest.raises(WiringError, match="offsets of the other sign"):
             calibrate(reversed_all, Options())
+
+
+@pytest.mark.parametrize("moves_m", [0.0, 5e-9])
+def test_noise_of_the_encoders_shows_no_sign(moves_m):
+    """It is as large with either sign of the offsets: both fit alike, by chance one better."""
+    for seed in range(6):
+        readings = offsets_of(moves_m, 0.0, phi_rad=1e-3, repeats=1, seed=seed,
+                              encoder_sigma_m=50e-9)
+        for one in (readings, turned_readings(readings, REVERSED)):
+            (failed,) = calibrate(one, Options()).verdict.failed
+            assert failed.name in ("sign_shown_by_lines", "sign_not_shown")
 
 
 @pytest.mark.parametrize("sense", Sense)
