@@ -39,8 +39,9 @@ def numbers(line):
 def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
     cell = {"with_ids": with_ids, "sense": sense, "servo_sigma": 0.0, "servo_sigma_theta": 0.0}
     simulate(tmp_path, "exact", PLAN, seed=5, cell=cell, truth={"phi": 1e-4})
+    on_its_targets = 5  # where all offsets might have the other sign: not qualified
     assert main(["solve", str(tmp_path / "exact"), "--sense", sense, "--quiet", "-o",
-                 str(tmp_path / "r.json")]) == 0
+                 str(tmp_path / "r.json")]) == on_its_targets
     found, truth = (read_json(tmp_path / name) for name in ("r.json", "exact/truth.json"))
     for axis in ("gx", "gy"):
         difference = np.array(found["error_map"][axis]) - np.array(truth[axis])
