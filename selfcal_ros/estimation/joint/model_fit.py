@@ -276,7 +276,7 @@ class _State:
         """Return whether the last step of each coefficient was below a part of its noise."""
         if self.equations is None:
             return True
-        variances = np.diag(self.equations.inverse(self.found.xy.sigma))
+        variances = np.maximum(np.diag(self.equations.inverse(self.found.xy.sigma)), 0.0)
         return bool((np.abs(self.stepped) <= part_m * np.sqrt(variances)).all())
 
     def finished(self) -> ModelFit:
