@@ -53,6 +53,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._rejected: dict[int, Marker] = {}  # by view
         self._rejected_in = ("", "")  # plan and run
         self._solved = self.publisher(names.private(names.SOLVED))
+        self._told: Any = None  # the last message on it
         self.alone_on += [names.ERROR_MAP.name, names.MEASUREMENT.name]
 
     def activate(self) -> None:
@@ -123,6 +124,8 @@ class Solver(ManagedNode[SolverSettings]):
     def _sweep(self) -> None:
         self._advance()
         self.session.save_again()
+        if self._told is not None:  # again, for who missed the only one
+            self._solved.publish(self._told)
 
     def _take(self, running: Future[SolvingOutcome]) -> None:
         """Take a solution."""
@@ -130,7 +133,8 @@ class Solver(ManagedNode[SolverSettings]):
         try:
             self.session.take(outcome)
         finally:
-            self._solved.publish(names.SOLVED.type(data=self.session.digest()))
+            self._told = names.SOLVED.type(data=self.session.digest())
+            self._solved.publish(self._told)
 
     def _once_solved(self, then: Callable[[], None]) -> None:
         """Call `then` once the readings received so far are solved."""
