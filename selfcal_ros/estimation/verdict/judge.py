@@ -211,7 +211,7 @@ def _sign_findings(solved: Solved, measurements: Measurements,
     if _is_declared(options) or not seen or sign_is_shown(measurements):  # nothing can show it
         return []
     model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
-    if model is None or model.equations is None or _stops_show_the_sign(model, measurements):
+    if model is None or model.equations is None:
         return []
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)
@@ -227,11 +227,12 @@ def _sign_findings(solved: Solved, measurements: Measurements,
         hidden = np.abs(untold[scale[0]]).max(initial=0.0) > NEGLIGIBLE
         return not hidden and 0 <= spread * model.found.xy.sigma**2 <= SIGN_U**2
 
-    if not is_shown(by_lines=True):
-        return [Finding("sign_not_shown")]
-    if is_shown(by_lines=False) or sign_of_lines_is_shown(measurements):
+    with_lines = is_shown(by_lines=True)
+    if with_lines and (is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)):
         return []
-    return [Finding("sign_shown_by_lines")]
+    if _stops_show_the_sign(model, measurements):
+        return []
+    return [Finding("sign_shown_by_lines" if with_lines else "sign_not_shown")]
 
 
 def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
@@ -243,7 +244,7 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
     a = (Q(0) + Q(2)) / 2 - Q(1). It has to be nearer to 0 than to 1. All signs reversed, o - s is
     a reading as good as s - o: a stage that stood on its targets has nothing to tell them apart by.
     """
-    problem = replace(model.problem, terms=(), residuals_xy=None)
+    problem = replace(model.problem, terms=())  # with its noise: lines weigh the same for each k
     stood = np.zeros_like(model.y)
     for row, (index, placed) in enumerate(zip(problem.grid.index, problem.ground.visits,
                                               strict=True)):

@@ -138,7 +138,7 @@ def test_the_sign_of_offsets_is_shown_by_their_scatter_or_declared(scatter, how,
 
 @pytest.mark.parametrize(("scatter", "repeats", "by_lines"), [
     ((0.0, 0.0), 5, True), ((20e-6, 0.0), 5, False), ((0.0, 1e-4), 5, False),
-    ((5e-9, 0.0), 1, False)])
+    ((10e-9, 0.0), 1, False)])
 @pytest.mark.parametrize("sense", Sense)
 def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(scatter, repeats, by_lines,
                                                                       sense):
