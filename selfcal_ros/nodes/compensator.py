@@ -48,8 +48,7 @@ class MapsOfOneNode:
                  inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]) -> None:
         self._node = node
         self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
-        self._waiting: dict[str, deque[tuple[float, Callable[[], None]]]] = {
-            topic.name: deque() for topic, _ in inputs}
+        self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque()
         self._rivals, self._rivals_s = "", 0.0  # last seen
         self._subscriptions: list[Any] = []
         self._subscribe()
@@ -74,10 +73,10 @@ class MapsOfOneNode:
         """Keep a message until its publisher has been alone for long enough."""
         if self._has_rivals():
             raise self._of_several(topic)
-        waiting = self._waiting[topic]
-        waiting.append((time.monotonic(), partial(take, message)))
-        if len(waiting) > MOST_WAITING:
-            waiting.popleft()
+        self._waiting.append((time.monotonic(), topic, partial(take, message)))
+        of_topic = [one for one in self._waiting if one[1] == topic]
+        if len(of_topic) > MOST_WAITING:
+            self._waiting.remove(of_topic[0])
             raise InputError(topic, f"a message is not used: more than {MOST_WAITING} within "
                              f"{ALONE_S:g} s", "publish each map once")
 
@@ -92,10 +91,9 @@ class MapsOfOneNode:
         if not self._rivals:
             self._node.say(Level.WARN, f"{rivals}: {KEPT}")
         self._rivals, self._rivals_s = rivals, time.monotonic()
-        for topic, waiting in self._waiting.items():  # whose they are cannot be told either
-            while waiting:
-                waiting.popleft()
-                self._node.refusals.add(topic, self._of_several(topic))
+        while self._waiting:  # whose they are cannot be told either
+            _, topic, _ = self._waiting.popleft()
+            self._node.refusals.add(topic, self._of_several(topic))
         return True
 
     def _look(self) -> None:
@@ -108,10 +106,9 @@ class MapsOfOneNode:
             self._node.say(Level.OK, "one node alone publishes maps again: they are used")
             self.close()
             self._subscribe()
-        for waiting in self._waiting.values():
-            while waiting and now_s - waiting[0][0] >= ALONE_S:
-                _, take = waiting.popleft()
-                take()
+        while self._waiting and now_s - self._waiting[0][0] >= ALONE_S:
+            _, _, take = self._waiting.popleft()
+            take()
 
 
 class CompensatorNode(ManagedNode[CompensatorSettings]):
