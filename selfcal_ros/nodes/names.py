@@ -81,7 +81,7 @@ RECEIVED = Topic("received", UInt64MultiArray, _qos(1, latched=True))
 taken, detections published and subscriptions connected to these, for a player's pace. Told again
 with each beat: a player that missed the only one would wait for ever."""
 SOLVED = Topic("solved", String, _qos(1, latched=True))
-"""The solver's fingerprint of the readings behind its results."""
+"""The solver's fingerprint of the readings behind its results, told again with each sweep."""
 
 
 def of_node(node: str, topic: Topic) -> Topic:

@@ -2,6 +2,7 @@
 """Managed nodes: bring-up and tear-down ten times over, errors in transitions, health."""
 
 import gc
+import sys
 import time
 import weakref
 
@@ -264,3 +265,13 @@ def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(graph, t
     assert received["detection"] == 7
     (journal,) = tmp_path.glob("journal_*")
     assert [topic for topic, *_ in decoded(BagReader(journal))] == [names.DETECTIONS.name] * 7
+
+
+@pytest.mark.parametrize("name", ["measurement_collector", "mark_detector"])
+def test_what_was_received_is_told_again_to_who_missed_it(graph, monkeypatch, name):
+    make = MANAGED[name]
+    monkeypatch.setattr(sys.modules[make.__module__], "BEAT_S", 0.05)
+    told = graph.listen(names.of_node(name, names.RECEIVED))
+    graph.node(make, **NEEDED.get(name, {}))
+    graph.until(lambda: len(told) > 2, "the same counts again")
+    assert all(list(message.data) == [0, 0, 0] for message in told)

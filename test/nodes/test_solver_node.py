@@ -192,6 +192,15 @@ def test_a_late_joiner_gets_map_and_summary(solve, graph):
     assert len(maps) == len(summaries) == 1
 
 
+def test_what_was_solved_is_told_again_to_who_missed_it(solve, graph, monkeypatch):
+    monkeypatch.setattr(solver_module, "SWEEP_S", 0.05)
+    solve()
+    told = graph.listen(names.of_node("solver", names.SOLVED))
+    graph.until(lambda: len(told) > 2, "the same readings again")
+    (solver,) = (node for node in graph.nodes if isinstance(node, Solver))
+    assert told[-1].data == told[-2].data == solver.session.digest() != ""
+
+
 def test_save_map_before_a_solution_that_failed_is_taken_says_why(graph, monkeypatch, tmp_path):
     """It takes the solution itself; what that raises ended the node."""
     monkeypatch.setattr(solver_module, "SWEEP_S", 3600.0)
