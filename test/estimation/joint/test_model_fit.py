@@ -112,6 +112,21 @@ def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
     assert len(steps) > 2 * model_fit.LATE and steps[-1] < 1e-12
 
 
+def test_in_a_linear_model_only_the_terms_change_what_is_taken_off_the_readings():
+    """What finite rotations take off is another change, which coefficients do not explain."""
+    plan, rng = plan_with(0, 0), np.random.default_rng(6)
+    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
+                                     sigma_m=2e-8, visits=True)
+    terms = parse_terms(["plate_scale:1e-6"], "")
+    for model, besides in (("linear", False), ("rigid", True)):
+        options = bare(misalignment_model=model, terms=terms)
+        state = model_fit._State(prepare(readings, options)[0])
+        state.step()
+        assert np.abs(state.changed).max() > 1e-10
+        assert (state._changed_besides_m > 1e-12) is besides
+        assert not state._terms_are_still(0.0) and state._terms_are_still(1.0)
+
+
 def test_the_rotation_that_a_view_shows_of_its_own_is_that_of_its_marks_about_their_middle():
     rng = np.random.default_rng(2)
     poses = tuple(LatticePose(q, (0, 0), None) for q in (0, 1, 2))

@@ -2,6 +2,7 @@
 """A size that the readings contradict is told, and does not bend the map in silence."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
+from selfcal_ros.estimation.terms.equations import FREE, roots_by_term
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm, parse_terms
@@ -231,3 +233,16 @@ def test_one_pattern_of_bending_alone_contradicts_the_size_of_all():
     p, together = np.array(found).T
     assert (p < 5e-4).all()
     assert (together > 1e-3).sum() >= 2
+
+
+def test_a_coefficient_that_is_known_exactly_leaves_no_part_to_free_ones():
+    """Rounding, over a variance of zero, overflowed."""
+    sizes = ModelTerm("line_eccentricity", 1.0), ModelTerm("rotation", 1.0)
+    columns = SimpleNamespace(
+        columns=tuple(SimpleNamespace(term=term.name, size=term.size) for term in sizes),
+        size=np.ones(2), rows=lambda names: np.array([term.name in names for term in sizes]))
+    covariance = np.array([[1e24, 1e7], [1e7, 0.0]])
+    parts = dict(roots_by_term(covariance, columns))
+    assert parts.pop(FREE).shape == (2, 0)
+    total = sum(root @ root.T for root in parts.values())
+    np.testing.assert_allclose(total, covariance, atol=1e8)
