@@ -232,7 +232,9 @@ def _sign_findings(solved: Solved, measurements: Measurements,
         return []
     if _stops_show_the_sign(model, measurements):
         return []
-    return [Finding("sign_shown_by_lines" if with_lines else "sign_not_shown")]
+    if with_lines:
+        return [Finding("sign_shown_by_lines")]
+    return [Finding("sign_not_shown")]
 
 
 def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
