@@ -318,8 +318,9 @@ def requests_of(kind, traps):
     for base in BASES.get(name, [None]):
         request = kind.Request(**({} if name is None else {name: base}))
         yield request
-        for _, spoilt in worst(request):
-            yield spoilt
+        for place, spoilt in worst(request):
+            if not place.endswith("_array_value"):  # the value is a text: arrays are not read
+                yield spoilt
     for path in traps if "path" in fields else ():
         yield kind.Request(path=path)
 
@@ -390,7 +391,7 @@ def test_each_request_at_its_worst_is_answered_and_ends_nothing(
             asked[node.get_fully_qualified_name()] += len(answers)
             called.add(service.service_name)
             graph.hand.destroy_client(client)
-    assert len(asked) == len(all_kinds) and min(asked.values()) > 300, asked
+    assert len(asked) == len(all_kinds) and min(asked.values()) > 200, asked
 
     def offered():
         return {name for node in all_kinds for name, _ in node.get_service_names_and_types_by_node(

@@ -14,8 +14,8 @@ TEXTS = ("", "no such", "../../outside", "/dev/zero", "\x1b[2J\x1b]0;title\x07",
 WIDTHS = {"int8": 8, "uint8": 8, "octet": 8, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64}
 HEAD = 12
 """Bytes of the encapsulation and the stamp behind it."""
-LONG = 20_000
-"""Elements of an array that is much too long."""
+LONG = 11_000
+"""Elements of an array that is too long: there are no more than 10,000 marks."""
 
 
 def worst(message: Any) -> Iterator[tuple[str, Any]]:
