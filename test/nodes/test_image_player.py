@@ -7,10 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from rclpy.serialization import deserialize_message
 
 from selfcal_ros.bagio.offline import BagSession, Playlist, collect_bag
 from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.settings.detector import DetectorSettings
@@ -41,15 +43,13 @@ def found(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("options", [{"rate": 5.0}, {"rate": 0.0, "seed": 3}],
-                         ids=["at a rate", "shuffled"])
-def test_images_that_are_played_give_the_map_of_detect_and_solve(graph, found, options):
+def test_images_that_are_played_give_the_map_of_detect_and_solve(graph, found):
     maps, solved = graph.listen(names.ERROR_MAP), graph.listen(
         names.of_node("solver", names.SOLVED))
     detector = graph.node(MarkDetectorNode, **DETECTS)
     collector = graph.node(MeasurementCollector)
     graph.node(Solver)
-    player = graph.node(BagPlayer, bag=str(BAG), **options)
+    player = graph.node(BagPlayer, bag=str(BAG), rate=0.0, seed=3)
     most = []
     graph.until(lambda: most.append(player.player.sent["image"] - (
         player.player.taken or 0)) or player.finished.done(), "the end of the bag")
@@ -120,16 +120,34 @@ PARAMS = """
 """
 
 
-def test_replay_gives_the_result_of_detect_and_solve_bit_for_bit(ros_environment, found, tmp_path):
+def of_two_cells(folder):
+    """Write the bag of images as of two cells, one in the namespace cell2; return its folder."""
+    with BagWriter(folder) as writer, next(BAG.glob("*.mcap")).open("rb") as file:
+        known = set()
+        for schema, channel, message in make_reader(file).iter_messages():
+            for topic in (channel.topic, f"/cell2{channel.topic}"):
+                if topic not in known:
+                    writer.add_topic(topic, schema.name, [])
+                    known.add(topic)
+                writer.write_raw(topic, message.data, message.log_time)
+    return folder
+
+
+def test_processes_give_the_result_of_detect_and_solve_bit_for_bit(
+        ros_environment, found, tmp_path, capfd):
     """Options win over the parameter file: one pixel size in it is wrong."""
     params, replayed, solved = (tmp_path / name for name in ("p.yaml", "replayed", "solved"))
     params.write_text(PARAMS)
-    common = ["--params", str(params), "--quiet", "-o"]
-    assert main(["replay", str(BAG), "--fast", "--shuffle", "3", "--pixel-size", "6e-6", *common,
-                 str(replayed)]) == 0
+    bag, common = of_two_cells(tmp_path / "bag"), ["--params", str(params), "--quiet", "-o"]
+    assert main(["replay", str(bag), "--namespace", "cell2", "--fast", "--shuffle", "3",
+                 "--pixel-size", "6e-6", *common, str(replayed)]) == 0
     assert main(["solve", str(found), *common, str(solved)]) == 0
+    said = capfd.readouterr()
+    assert "ERROR" not in said.out + said.err
+    assert "Traceback" not in said.out + said.err
     replayed, solved = read_json(replayed), read_json(solved)
-    assert replayed.pop("input")["file"] == "camera" != solved.pop("input")["file"]
+    assert replayed.pop("input")["file"] == "bag"
+    assert solved.pop("input")["file"] == "bag"
     for result in (replayed, solved):
         del result["digest"]["input"]
         result["provenance"].pop("created")

@@ -135,19 +135,6 @@ def test_of_two_cells_one_must_be_named(graph, two_cells):
         ReplaySession(player, "saved.json", context=graph.context)
 
 
-def test_processes_give_the_result_of_solve_bit_for_bit(
-        ros_environment, two_cells, tmp_path, capfd):
-    bag, replayed, solved = (str(name) for name in (
-        two_cells, tmp_path / "replayed", tmp_path / "solved"))
-    for verb, output in ((["replay", "--rate", "50"], replayed), (["solve"], solved)):
-        assert selfcal([*verb, bag, "--namespace", "cell2", "--quiet", "-o", output]) == 0
-    replayed, solved = ((tmp_path / name).read_text() for name in ("replayed", "solved"))
-    assert undated(replayed) == undated(solved)
-    said = capfd.readouterr()
-    assert "ERROR" not in said.out + said.err
-    assert "Traceback" not in said.out + said.err
-
-
 @pytest.mark.parametrize(("options", "arguments"), [
     ([], ["1.0", "-1", ""]), (["--fast"], ["0.0", "-1", ""]),
     (["--rate", "50"], ["50.0", "-1", ""]), (["--shuffle", "3"], ["1.0", "3", ""]),

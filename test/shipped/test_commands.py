@@ -16,7 +16,7 @@ FILES = (re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S),
          re.compile(r"```\w+ title=\"(\w+\.\w+)\"\n(.*?)```", re.S))
 ONLY_PARSED = {
     "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
-    "replay": "run by test/nodes/test_replay.py",
+    "replay": "run by test/nodes/test_image_player.py",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
     "cell try": "asks a person; test/cli/test_cell_try.py",
     "measure examples/microscope": "needs pymmcore; run by test/machine/test_micromanager.py",
