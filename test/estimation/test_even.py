@@ -8,6 +8,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import ThetaDatum
@@ -15,6 +16,7 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.papers.methods import calibrate_by, calibrate_by_law
 from test.support.collecting import collect, scene
 from test.support.dense_lattice import solve
+from test.support.options import BARE
 from test.support.plans import image_plan, plan_of
 from test.support.refusals import in_words
 from test.support.truth import random_truth, simulate_measurements
@@ -113,7 +115,7 @@ def test_errors_lie_in_u():
         plan = mixed_plan("0, 90, tx, ty", *((8, 0), (6, 4), (7, 6), (4, 0))[seed % 4], count=8,
                           line=True)
         truth, readings = measured(plan, seed, sigma_theta_rad=1e-6)
-        result = calibrate(readings, Options(assumed=()))
+        result = solve_joint(readings, BARE).result
         emap, k = result.error_map, result.noise.k_xy
         error = np.stack([emap.gx, emap.gy]) - truth.g
         u = np.stack([emap.u_gx, emap.u_gy])

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.joint import noise_effects, solve
 from selfcal_ros.estimation.joint.noise_effects import time_correlation
@@ -67,10 +66,10 @@ def test_slow_noise_is_in_the_uncertainty(monkeypatch):
     inside, unaware = [], []
     for seed in range(4):
         truth, readings = measured(11, seed, slow_m=20e-9)
-        inside.append(covered(calibrate(readings, flat), truth.g))
+        inside.append(covered(solve_joint(readings, flat).result, truth.g))
         with monkeypatch.context() as patch:
             patch.setattr(solve, "MAX_NODES", 0)
-            unaware.append(covered(calibrate(readings, flat), truth.g))
+            unaware.append(covered(solve_joint(readings, flat).result, truth.g))
     assert np.mean(inside) > max(0.93, np.mean(unaware) + 0.01)
 
 
