@@ -258,7 +258,7 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
 
 
 @pytest.mark.parametrize(("kind", "size"), [
-    ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9), ("smooth", 100e-9)])
+    ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9)])
 def test_coverage_and_false_alarms(kind, size):
     """95.45 % within U; E_n beyond 1 in 4.55 % of the nodes, and 5 % of runs, without a part.
 

@@ -12,10 +12,11 @@ from scipy.stats import binom, norm
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare, compare_with_laser
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.normal import equations
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.model.artifact import Artifact
-from test.support.options import bare
+from test.support.options import BARE, bare
 from test.support.recalibrations import responses, sizes_of
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 
@@ -28,7 +29,7 @@ def calibrated(seed, truth=None, *, sigma=SIGMA_M):
     truth = truth or random_truth(ARTIFACT, 4, np.random.default_rng(99))
     readings = simulate_measurements(truth, hu_plan(truth.artifact), rng, sigma_m=sigma,
                                      sigma_theta_rad=SIGMA_RAD)
-    return calibrate(readings, bare(causes=False))
+    return solve_joint(readings, BARE).result
 
 
 A, B = calibrated(1), calibrated(2)
@@ -202,8 +203,8 @@ def test_uncertainty_of_squareness_is_that_of_every_reading_moved_in_turn():
         for view in readings.views))
     linear = bare(misalignment_model="linear", causes=False)
     answers = responses(
-        lambda moved: np.array([calibrate(moved, replace(
-            linear, uncertainty=False)).error_map.nonorthogonality]),
+        lambda moved: np.array([solve_joint(moved, replace(
+            linear, uncertainty=False)).result.error_map.nonorthogonality]),
         readings, sizes_of(readings, SIGMA_M, SIGMA_RAD))
     laser = {"error_map_equivalent": {"nonorthogonality": 0.0, "u_nonorthogonality": 0.0}}
     row = compare_with_laser(calibrate(readings, linear), laser, "out.json")[0]

@@ -15,16 +15,16 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes
 from test.support import placed
 from test.support.lattice_plans import plan_of
-from test.support.options import BARE, bare
+from test.support.options import BARE
 from test.support.truth import random_truth, simulate_measurements
 
 PLAN = plan_of("0,90,tx", Artifact(5, 0.01, 8), lines=1)
-DRAWS = 60
+DRAWS = 40
 
 
 def calibrated(truth, rng):
-    return calibrate(simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
-                     bare(causes=False))
+    return solve_joint(simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
+                       BARE).result
 
 
 def test_plates_measured_twice_agree_five_times_in_hundred():

@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,6 +27,13 @@ def _equal_white_noise(monkeypatch):
     monkeypatch.setattr(judge, "LACK_LEVEL", 0.0)
 
 
+@cache
+def solved(plan, model, sense=Sense.MICROSCOPE_MOVES):
+    """Return the result and the dense least squares of readings; of lines some are missing."""
+    return both(measured(plan, model, sense, missing=0.1 * (plan == "lines")), model,
+                misalignment_model="linear", at_places=False)
+
+
 def saved(result):
     return result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
 
@@ -41,8 +49,7 @@ def require_same(found, wanted, rel):
 @pytest.mark.parametrize("model", ["none", "assumed", "sized", "free"])
 @pytest.mark.parametrize("plan", ["lines", "oblong"])
 def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
-    result, dense = both(measured(plan, model, sense, missing=0.1 * (plan == "lines")), model,
-                         misalignment_model="linear", at_places=False)
+    result, dense = solved(plan, model, sense)
     known = together(saved(result))
     dense.grid(known.sites)
     dense.plate(known.marks, known.sites)
@@ -59,8 +66,7 @@ def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("model", ["none", "assumed", "sized"])
 def test_covariance_of_both_angular_maps(model, sense):
-    result, dense = both(measured("lines", model, sense, missing=0.1), model,
-                         misalignment_model="linear", at_places=False)
+    result, dense = solved("lines", model, sense)
     known, cover = together(saved(result)).lines()
     rows = np.zeros((2, dense.K, len(dense.p)))
     for part, at, here in zip(rows, (dense.gt, dense.at), known, strict=True):
@@ -74,8 +80,7 @@ def test_covariance_of_both_angular_maps(model, sense):
 
 
 def test_what_is_not_kept_is_not_known():
-    result, _ = both(measured("oblong", "sized"), "sized",
-                     misalignment_model="linear", at_places=False)
+    result, _ = solved("oblong", "sized")
     assert together(saved(result)) is not None
     kept = replace(result.kept, factors=replace(result.kept.factors, beside={}))
     assert together(replace(result, kept=kept)) is None
@@ -90,8 +95,7 @@ def test_what_is_not_kept_is_not_known():
                    "of_map": np.concatenate([kept.of_map, kept.of_map[:1]])},
      "no effects on the plate")])
 def test_factors_without_what_belongs_to_them_are_refused(changed, message):
-    result, _ = both(measured("oblong", "sized"), "sized",
-                     misalignment_model="linear", at_places=False)
+    result, _ = solved("oblong", "sized")
     factors = replace(result.kept.factors, **changed(result.kept.factors))
     known = together(replace(result, kept=replace(result.kept, factors=factors)))
     with pytest.raises(InputError, match=f"covariance_terms: {message}; write the result again"):

@@ -9,6 +9,7 @@ import pytest
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import plan_check, suggest
 from selfcal_ros.estimation.observability.plan_check import (
@@ -178,10 +179,10 @@ def test_gain_is_that_of_every_reading_moved_in_turn():
     found = predict(system, plan.artifact, ThetaDatum.XY_AXES)
     rng = np.random.default_rng(7)
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng, linear=True)
-    options = bare(misalignment_model="linear", uncertainty=False, causes=False)
+    options = bare(misalignment_model="linear", uncertainty=False)
 
     def solve(moved):
-        emap = calibrate(moved, options).error_map
+        emap = solve_joint(moved, options).result.error_map
         return np.array([emap.gx.ravel(), emap.gy.ravel()])
 
     answers = responses(solve, readings, sizes_of(readings, 1e-8, 1.0)) / 1e-8
