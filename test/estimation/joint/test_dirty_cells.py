@@ -63,7 +63,7 @@ def population(dirty, runs):
 
 
 @pytest.mark.parametrize(("dirty", "cells"), [
-    ({("90", CORNER): 1}, 9), ({("0", (0, 0)): 0, ("90", CORNER): 3}, 9),
+    ({("0", (0, 0)): 0, ("90", CORNER): 1}, 9),
     (everywhere((0, 0)), 8), (everywhere(CORNER, (-1, 0)), 7)])
 def test_map_and_camera_are_found_without_some_cells(dirty, cells):
     maps, cameras, results = population(dirty, 3)

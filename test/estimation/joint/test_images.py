@@ -201,7 +201,7 @@ DISTORTED = {"microscope_distortion": 0.02, "microscope_field_m": 1.414e-3,
 
 
 @pytest.mark.parametrize(("part", "size", "sense", "runs"), [
-    (0.3, 7, Sense.MICROSCOPE_MOVES, 4), (1.0, 9, Sense.PLATE_MOVES, 3),
+    (0.3, 7, Sense.MICROSCOPE_MOVES, 4), (1.0, 7, Sense.PLATE_MOVES, 3),
     (3.0, 7, Sense.MICROSCOPE_MOVES, 6)])  # the more images share, the fewer numbers a run has
 def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense, runs):
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
@@ -257,12 +257,12 @@ def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
 
 def test_degrees_of_freedom_are_those_of_the_maps_variance():
     power, dof = [], []
-    for seed in range(60):
+    for seed in range(30):
         found = solve_joint(measured(3 * MARK, seed, size=5)[1], ALONE).result
         power.append((found.error_map.u_gx**2).mean())
         dof.append(found.noise.dof_xy)
     shown = 2 * np.mean(power) ** 2 / np.var(power, ddof=1)
-    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 0.7 and 1.4
+    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 0.55 and 1.6
     assert np.mean(dof) < 100
 
 
@@ -278,9 +278,9 @@ def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
 
 
 def test_a_camera_without_distortion_has_a_linear_error():
-    _, results = population(MARK, 5, 8, repeats=2)
+    _, results = population(MARK, 5, 5, repeats=2)
     cameras = [found.camera for _, found in results]
-    assert sum(camera.degree == 1 for camera in cameras) >= 7
+    assert sum(camera.degree == 1 for camera in cameras) >= 4
     assert not any(found.verdict.causes for _, found in results)
     scale = [camera.scale / camera.u_scale for camera in cameras]
     assert np.sqrt(np.mean(np.square(scale))) < 1.8

@@ -24,7 +24,7 @@ from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 
 LINEAR = bare(causes=False, at_places=False, misalignment_model="linear")
-RUNS = 5
+RUNS = 4
 
 
 def sessions(image_m, seed, *, size=7, turn=0, repeats=1, change=0.0, missing=0.0,
@@ -152,7 +152,7 @@ def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
 
 
 def test_a_changed_stage_is_said_to_have_changed():
-    away, _, results = population(MARK, 4, change=2e-7)
+    away, _, results = population(MARK, 3, change=2e-7)
     require_within(away)
     assert all(result.recheck.changed for result in results)
 

@@ -7,7 +7,7 @@ from scipy.stats import binom
 
 from tools.rechecking import Case, run
 
-MACHINES = 4
+MACHINES = 3
 
 
 @pytest.mark.parametrize("plan", ["lattice", "general six"])
