@@ -77,14 +77,12 @@ def test_a_wrong_camera_or_sensor_is_named_at_the_first_marks(tmp_path, fault, s
     assert len(spoilt.moves) < 20
 
 
-IN_THE_MIDDLE = [
+OF_THE_STAGE = [
     ("connection lost in a move", "the connection was lost"),
     ("connection lost at a reading", "the connection was lost"),
     ("no answer to a move", "machine.move_to: TimeoutError: no answer in 5 s"),
     ("no answer for the position", "machine.position: TimeoutError: no answer in 5 s"),
-    ("no answer of the camera", "machine.image: TimeoutError: no answer in 5 s"),
     ("driver raises an error of its own", "machine.move_to: OSError: .*faults.py, line"),
-    ("camera disconnected", "machine.image: OSError"),
     ("position is not a number", "its position is .*nan"),
     ("position is infinite", "its position is .*inf"),
     ("position is None", "its position is None"),
@@ -97,7 +95,10 @@ IN_THE_MIDDLE = [
     ("creeps at rest", "y (does not come to rest|moved by)"),
     ("replies of another axis", "it answers for the other axis"),
     ("zero lost at rest", "x has changed by 3000 um at rest, without a command"),
-    ("moved by hand", "y has changed by 50 um at rest, without a command"),
+    ("moved by hand", "y has changed by 50 um at rest, without a command")]
+OF_IMAGES = [
+    ("no answer of the camera", "machine.image: TimeoutError: no answer in 5 s"),
+    ("camera disconnected", "machine.image: OSError"),
     ("last image again", "returns the last image again"),
     ("late by one frame", "late by one frame"),
     ("torn image", "nothing is seen at the last 5 stops"),
@@ -113,10 +114,11 @@ IN_THE_MIDDLE = [
     ("stamp of the past", "the stamp of an exposure")]
 
 
-@pytest.mark.parametrize(("fault", "said"), IN_THE_MIDDLE)
+@pytest.mark.parametrize(("fault", "said", "camera"), [
+    *((*fault, False) for fault in OF_THE_STAGE), *((*fault, True) for fault in OF_IMAGES)])
 def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
-        tmp_path, fault, said):
-    cell, machine = write_cell(tmp_path, camera=True)
+        tmp_path, fault, said, camera):
+    cell, machine = write_cell(tmp_path, camera=camera)
     spoilt = Spoilt(machine, fault, after=ONSET)
     with pytest.raises((MachineError, NoDataError), match=said):
         run_of(tmp_path, spoilt, cell).measure()
@@ -126,10 +128,10 @@ def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
     assert sum(int(view.count.sum()) for view in readings.views) >= 8
 
 
-@pytest.mark.parametrize("fault", [
-    "connection lost in a move", "zero lost at rest", "out of focus"])
-def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, fault):
-    cell, machine = write_cell(tmp_path, camera=True)
+@pytest.mark.parametrize(("fault", "camera"), [
+    ("connection lost in a move", False), ("zero lost at rest", False), ("out of focus", True)])
+def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, fault, camera):
+    cell, machine = write_cell(tmp_path, camera=camera)
     with pytest.raises((MachineError, NoDataError)):
         run_of(tmp_path, Spoilt(machine, fault, after=ONSET), cell).measure()
     run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12)).measure(resume=True)
@@ -138,13 +140,14 @@ def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, faul
     assert np.abs(away).max() < 5e-8
 
 
-HARMLESS = ["position one reading old", "ends a little short", "light is failing",
-            "camera was knocked"]
+HARMLESS = {"position one reading old": False, "ends a little short": False,
+            "light is failing": True, "camera was knocked": True}
+"""Faults, and whether they are the camera's."""
 
 
-@pytest.mark.parametrize("fault", HARMLESS)
-def test_a_fault_that_the_readings_allow_for_leaves_the_map_right(tmp_path, fault):
-    cell, machine = write_cell(tmp_path, camera=True)
+@pytest.mark.parametrize(("fault", "camera"), HARMLESS.items())
+def test_a_fault_that_the_readings_allow_for_leaves_the_map_right(tmp_path, fault, camera):
+    cell, machine = write_cell(tmp_path, camera=camera)
     desk = Agreeing()
     run_of(tmp_path, Spoilt(machine, fault, after=ONSET), cell, desk=desk).measure()
     away, _ = away_from(machine.truth, tmp_path / "bag")
