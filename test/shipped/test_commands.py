@@ -4,7 +4,7 @@
 import re
 import shlex
 from importlib.util import find_spec
-from shutil import copytree
+from shutil import copyfile, copytree
 
 import pytest
 
@@ -63,15 +63,33 @@ def desk(tmp_path, monkeypatch, jumping_clocks):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """Return the result of a shipped bag."""
+    file = tmp_path_factory.mktemp("solved") / "RESULT.json"
+    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", str(file)]) == 0
+    return file
+
+
+@pytest.fixture(scope="module")
+def checked():
+    """Return a set that fills with the commands that check shipped plans: once is enough."""
+    return set()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_commands_run(page, desk, capsys):
+def test_commands_run(page, desk, solved, checked, capsys):
     text = page.read_text()
     for name, content in (found for kind in FILES for found in kind.findall(text)):
         (desk / name).write_text(content)
     run = [(command, code) for command, code in commands(text) if not parsed_alone(command)]
     if any("RESULT.json" in command for command, _ in run):
-        assert main(["solve", "bags/hu_noise", "--quiet", "-o", "RESULT.json"]) == 0
+        copyfile(solved, "RESULT.json")
     for command, code in run:
+        if (command, code) in checked:
+            continue
+        if command.startswith("selfcal plan check config/"):
+            checked.add((command, code))
         words = shlex.split(command)
         if "-o" in words:  # one of two ways to write the same file
             written = desk / words[words.index("-o") + 1]
