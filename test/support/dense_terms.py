@@ -7,7 +7,6 @@ import numpy as np
 from scipy.stats import f as central_f
 from scipy.stats import ncf
 
-from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.terms.planned import planned_ground
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
@@ -30,9 +29,8 @@ class Dense:
         self.plan, self.assumed, self.sense = plan, assumed, sense
         self.nx, self.ny = plan.artifact.shape
         self.half = plan.artifact.grid_pitch_m * max(plan.artifact.half)
-        system = planned_system(plan.artifact, plan.views)
         # offsets and random orders are an assumption of the plan: they are taken as they are
-        self.visits = planned_ground(plan.artifact, plan.views, system, assumed).visits
+        self.visits = planned_ground(plan.artifact, plan.views, assumed).visits
         self.rows, self.weight, self.about, self.times = [], [], [], []
         for v, visits in enumerate(self.visits):
             self._view(v, visits)

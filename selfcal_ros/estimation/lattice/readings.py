@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readings on the lattice, in a canonical form that does not depend on their order; view poses."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import cast
 
@@ -11,7 +12,7 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose
 from selfcal_ros.model.readings import Measurements, ViewReadings
-from selfcal_ros.model.view import View, rotations_of
+from selfcal_ros.model.view import View, rotations_of, with_sub_views
 
 
 @lru_cache(maxsize=1024)
@@ -95,6 +96,29 @@ class Deviations[Pose](Marks[Pose]):
 
 GridData = Deviations[AnyPose]
 AngularData = Deviations[float]
+
+
+def planned_readings(artifact: Artifact, views: Sequence[View]) -> Measurements:
+    """Return the readings of planned views before they are measured, all 0: every mark and line.
+
+    The cells of images are views of their own.
+    """
+    return Measurements("", artifact, tuple(
+        _planned(view, artifact) for view in with_sub_views(views)))
+
+
+def _planned(view: View, artifact: Artifact) -> ViewReadings:
+    out = ViewReadings(view)
+    if view.grid:
+        read = in_field(view, artifact)
+        nothing = np.zeros(int(read.sum()))
+        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
+                      count=np.full(len(nothing), view.repeats))
+    if view.angular and artifact.angular_count:
+        lines = np.arange(artifact.angular_count)
+        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
+                      count_theta=np.full(len(lines), view.repeats))
+    return out
 
 
 def grid_data(measurements: Measurements) -> GridData:

@@ -21,7 +21,12 @@ from scipy.sparse import csr_matrix
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.lattice.connectivity import Components, Gauge
 from selfcal_ros.estimation.lattice.maps import MapSpline, PlacedViews
-from selfcal_ros.estimation.lattice.readings import Marks, in_field, pose_of
+from selfcal_ros.estimation.lattice.readings import (
+    Marks,
+    angular_data,
+    grid_data,
+    planned_readings,
+)
 from selfcal_ros.estimation.normal.angular import (
     GAP,
     KNOWN,
@@ -35,7 +40,7 @@ from selfcal_ros.estimation.normal.eliminated import over_nodes
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import AnyPose, LatticePose, PlacedPose
-from selfcal_ros.model.view import View, rotations_of, with_sub_views
+from selfcal_ros.model.view import View
 
 TRACE = 1e-6
 """Part of a whole, or of a misalignment of unit length, that counts as none: rounding is 1e-9."""
@@ -623,20 +628,8 @@ def planned_system(artifact: Artifact, views: Sequence[View]) -> NormalEquations
     views : sequence of View
         The plan; the cells of images are views of their own.
     """
-    views = with_sub_views(views)
-    grid_views = [(i, v) for i, v in enumerate(views) if v.grid]
-    poses = tuple(pose_of(view, artifact) for _, view in grid_views)
-    angular = [(i, v) for i, v in enumerate(views) if v.angular and artifact.angular_count]
-    turns = tuple(pose_of(v, artifact).turn_lines or 0 for _, v in angular)
-    field = np.array([in_field(view, artifact) for _, view in grid_views])
-    weight = field.reshape(len(poses), *artifact.shape) * np.array(
-        [v.repeats for _, v in grid_views], dtype=float)[:, None, None]
-    lines = np.array([v.repeats for _, v in angular], dtype=float)
-    return _equations(
-        Marks(poses, weight, tuple(i for i, _ in grid_views),
-              rotations=rotations_of([view for _, view in grid_views]), plate=artifact.placed),
-        Marks(turns, np.ones((len(turns), artifact.angular_count)) * lines[:, None],
-              tuple(i for i, _ in angular), artifact.harmonics))
+    readings = planned_readings(artifact, views)
+    return _equations(grid_data(readings), angular_data(readings))
 
 
 class Memo[Key, Value]:

@@ -26,7 +26,12 @@ from selfcal_ros.estimation.joint.problem import (
     problem_of,
 )
 from selfcal_ros.estimation.joint.solve import MICROSCOPE_PARTS, noise_of, views_of
-from selfcal_ros.estimation.lattice.readings import Marks, angular_data, grid_data
+from selfcal_ros.estimation.lattice.readings import (
+    Marks,
+    angular_data,
+    grid_data,
+    planned_readings,
+)
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
 from selfcal_ros.estimation.normal.equations import TRACE, lines_of, system_of
@@ -68,7 +73,7 @@ from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
 from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
-from selfcal_ros.model.view import Plan, View, cells_seen, with_sub_views
+from selfcal_ros.model.view import Plan, cells_seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -562,8 +567,7 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     NotIdentifiableError, InputError
         As `selfcal_ros.estimation.recheck.solve.recheck`.
     """
-    readings = Measurements(plan.plan_id, plan.artifact, tuple(
-        _planned(view, plan) for view in with_sub_views(plan.views)))
+    readings = replace(planned_readings(plan.artifact, plan.views), plan_id=plan.plan_id)
     found: Rechecked = recheck_of(readings, Options(assumed=(), misalignment_model="linear"), plate)
     noise = plate.result.noise
     root = np.sqrt(min(view.repeats for view in plan.views))
@@ -572,18 +576,3 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
     return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
                           rms(map_change(found.new, found.artifact, plate).u) / unit)
-
-
-def _planned(view: View, plan: Plan) -> ViewReadings:
-    """Return the readings of a view, all 0."""
-    out, artifact = ViewReadings(view), plan.artifact
-    if view.grid:
-        read = view.pose.in_field(artifact)
-        nothing = np.zeros(int(read.sum()))
-        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
-                      count=np.full(len(nothing), view.repeats))
-    if view.angular and artifact.angular_count:
-        lines = np.arange(artifact.angular_count)
-        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
-                      count_theta=np.full(len(lines), view.repeats))
-    return out

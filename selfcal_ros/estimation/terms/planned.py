@@ -14,15 +14,17 @@ import numpy as np
 from scipy.special import ndtri
 
 from selfcal_ros.blocks import block_of
-from selfcal_ros.estimation.normal.equations import NormalEquations
+from selfcal_ros.estimation.lattice.readings import angular_data, grid_data, planned_readings
+from selfcal_ros.estimation.normal.equations import NormalEquations, lines_of
 from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks, term_columns
 from selfcal_ros.estimation.terms.equations import (
     ProjectedColumns,
     TermEquations,
     equations_of_columns,
 )
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, view_time
+from selfcal_ros.estimation.terms.visits import TermInputs, ground_of
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
 from selfcal_ros.model.view import (
     DEFAULT_ORDER,
@@ -30,7 +32,6 @@ from selfcal_ros.model.view import (
     View,
     parse_order,
     placings_of,
-    with_sub_views,
 )
 from selfcal_ros.model.visit_order import VisitSequence, approach_signs, visit_sequence
 
@@ -78,9 +79,8 @@ class Assumed:
     error_rad: float = 10e-6
 
 
-def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEquations,
-                   assumed: Assumed) -> TermInputs:
-    """Return the inputs for the planned views.
+def planned_ground(artifact: Artifact, views: Sequence[View], assumed: Assumed) -> TermInputs:
+    """Return the inputs for planned views.
 
     Parameters
     ----------
@@ -88,87 +88,75 @@ def planned_ground(artifact: Artifact, views: Sequence[View], system: NormalEqua
         The plate.
     views : sequence of View
         The plan.
-    system : NormalEquations
-        Their equations, see `planned_system`.
     assumed : Assumed
-        Visiting order and stop errors.
+        Visiting order, placings, errors.
     """
     rng = np.random.default_rng(1)
     x, y = assumed.error_m * np.random.default_rng([1, 1]).normal(size=(2, 2, *artifact.shape))
-    errors = x + 1j * y
-    views = with_sub_views(views)
-    grid_views = [views[i] for i in system.grid_index]
-    placings = placings_of(grid_views)
-    number = np.unique(placings, return_inverse=True)[1]  # the cells of an image see one plate
-    placed = np.array([_placed(number, *spread) for spread in SPREAD]).T
-    visits = tuple(_visits(artifact, view, assumed, rng, (row, errors))
-                   for row, view in zip(placed, grid_views, strict=True))
-    lines = [views[i] for i in system.angular_index]
-    shared = tuple(row for row, view in enumerate(lines) if view.grid)
-    return TermInputs(system.grid.views.z, artifact.grid_pitch_m * max(artifact.reach),
-                  system.grid.weight, visits, tuple(view.name for view in grid_views),
-                  line_names=tuple(view.name for view in lines), n_lines=artifact.angular_count,
-                  line_offsets=_line_offsets(system, assumed, number),
-                  with_lines=shared if len(shared) > 1 else (), placings=placings,
-                  placing_names=tuple(view.plan_view for view in grid_views),
-                  cells_m=np.array([view.cell_m for view in grid_views]), stage=artifact.field,
-                  drift_degree=assumed.drift_degree,
-                  poses=tuple(view.pose for view in grid_views))
-
-
-def _placed(number: np.ndarray, first: float, step: float) -> np.ndarray:
-    """Return rotations or positions of placings, in standard deviations."""
-    return ndtri((first + step * number) % 1)
-
-
-def _line_offsets(system: NormalEquations, assumed: Assumed, number: np.ndarray) -> np.ndarray:
-    """Return the offsets of lines at which the stage stops at their nominal angles, rad.
-
-    (views of lines, lines), given the placings of the views of marks; views of lines alone are
-    placings after those.
-    """
-    of_view = dict(zip(system.grid_index, number, strict=True))
-    last = int(number.max(initial=-1))
-    alone = (index for index in system.angular_index if index not in of_view)
-    of_view |= {index: last + 1 + at for at, index in enumerate(alone)}
-    placings = np.array([of_view[index] for index in system.angular_index], dtype=int)
-    turn = assumed.turn_rad * _placed(placings, *SPREAD[0])
     stage, plate = assumed.error_rad * np.random.default_rng([1, 2]).normal(
-        size=(2, system.angular.n_lines))
-    return system.angular.gather(stage) + plate + turn[:, None]
+        size=(2, artifact.angular_count))
+    planned = planned_readings(artifact, views)
+    lines = angular_data(planned)
+    of_lines = dict(zip(lines.index, lines_of(lines).gather(stage) + plate, strict=True))
+    expected = []
+    for index, (view, number) in enumerate(zip(planned.views, _placings(planned), strict=True)):
+        turn, *away = (ndtri((first + step * number) % 1) for first, step in SPREAD)
+        lies = assumed.turn_rad * turn, assumed.away_m * complex(*away)
+        if len(view.m):
+            visits = _visits(artifact, view, assumed, rng, lies=lies, errors=x + 1j * y)
+            view = replace(view, visits=visits, count=np.bincount(visits.mark, visits.count))
+        if index in of_lines:
+            view = replace(view, dtheta=of_lines[index] + lies[0])
+        expected.append(view)
+    readings = replace(planned, views=tuple(expected))
+    return ground_of(readings, grid_data(readings), artifact.grid_pitch_m * max(artifact.reach),
+                     drift_degree=assumed.drift_degree)
 
 
-def _visits(artifact: Artifact, view: View, assumed: Assumed, rng: np.random.Generator,
-            known: tuple[np.ndarray, np.ndarray]) -> ViewVisits:
+def _placings(planned: Measurements) -> list[int]:
+    """Return the number of the placing of the plate in each view; those of lines alone last.
+
+    The cells of an image see one plate.
+    """
+    placings = placings_of(view.view for view in planned.views)
+    number: dict[int, int] = {}
+    marks_first = sorted(range(len(placings)), key=lambda row: not planned.views[row].view.grid)
+    for row in marks_first:
+        number.setdefault(placings[row], len(number))
+    return [number[placing] for placing in placings]
+
+
+def _visits(artifact: Artifact, readings: ViewReadings, assumed: Assumed, rng: np.random.Generator,
+            *, lies: tuple[float, complex], errors: np.ndarray) -> GridVisits:
     """Return the visits of a view.
 
-    `known`: its misalignment in standard deviations, (3,); errors of stage and plate,
+    Given rotation, rad, and position, m, of the plate, and the errors of stage and plate,
     (2, nx, ny), m.
     """
-    turn, x, y = known[0] * (assumed.turn_rad, assumed.away_m, assumed.away_m)
-    errors = known[1]
+    view, (turn, away) = readings.view, lies
     order = assumed.order or view.visit_order or DEFAULT_ORDER
     found = visit_sequence(artifact, view, order=order, rng=rng) if parse_order(
         order).name == "random" else _sequence(artifact, replace(view, name=""), order)
-    n, ends = len(found), (found.time[0], found.time[-1]) if len(found) else (0, 0)
+    n = len(found)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    phase = complex(view.pose.phase).conjugate()
+    phase = complex(view.pose.phase)
     mark = artifact.flat(found.m, found.n)
     near = mark if artifact.marks else artifact.flat(*(
         np.clip(at, *ends).astype(int)  # the nearest, off the lattice
         for at, ends in zip(artifact.nearest(found.i, found.j), artifact.limits, strict=True)))
-    stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] / phase
+    stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] * phase
     u, v = artifact.places(found.m, found.n)
-    arm = (u + 1j * v) * artifact.grid_pitch_m / phase
-    offset = np.expm1(1j * turn) * arm + complex(x, y) + plate - stage - stops - aside
+    arm = (u + 1j * v) * artifact.grid_pitch_m * phase
+    offset = np.exp(-1j * turn) * (
+        np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign
-    return ViewVisits(mark, found.count.astype(float), np.zeros(n, dtype=complex),
-                      view_time(found.time, *ends), np.exp(-1j * turn) * offset,
-                      approach_signs((sites + aside).real).astype(float),
-                      approach_signs((sites + aside).imag).astype(float), phase)
+    return GridVisits(
+        np.searchsorted(artifact.flat(readings.m, readings.n), mark), np.zeros(n), np.zeros(n),
+        found.count, np.rint(2 * found.time).astype(int), offset.real, offset.imag,
+        approach_signs((sites + aside).real), approach_signs((sites + aside).imag))
 
 
 @lru_cache(maxsize=256)
@@ -184,7 +172,7 @@ def planned_equations(plan: Plan, system: NormalEquations, terms: Iterable[Model
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
     to them.
     """
-    ground = planned_ground(plan.artifact, plan.views, system, assumed)
+    ground = planned_ground(plan.artifact, plan.views, assumed)
     columns = term_columns(ground, terms)
     n, length = 3 * system.grid.n_views, ground.half_width_m
     inverse, ratio = np.zeros((system.size, system.size)), 0.0

@@ -167,8 +167,7 @@ def test_a_plate_bent_in_one_view_only(views, worst):
 
 def test_the_assumed_offsets_are_misalignments_and_stop_errors():
     plan = plan_of("0, 90, tx", 31)
-    system = planned_system(plan.artifact, plan.views)
-    exact = planned_ground(plan.artifact, plan.views, system, Assumed(
+    exact = planned_ground(plan.artifact, plan.views, Assumed(
         stop_error_m=1e-15, error_m=1e-15)).visits
     for view, visits in zip(plan.views, exact, strict=True):
         found = visit_sequence(plan.artifact, view)
@@ -183,7 +182,7 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
         # the same draws with stop errors, or errors of stage and plate: those have their size
         for more, size in (({"stop_error_m": 5e-6, "error_m": 1e-15}, 5e-6),
                            ({"stop_error_m": 1e-15, "error_m": 2e-6}, 2e-6 * 2**0.5)):
-            rough = planned_ground(plan.artifact, plan.views, system, Assumed(**more))
+            rough = planned_ground(plan.artifact, plan.views, Assumed(**more))
             added = rough.visits[plan.views.index(view)].offset - visits.offset
             n = len(added)
             for part in (added.real, added.imag):

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.visit_order import visit_sequence
@@ -17,7 +16,7 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     plan = plan_of("0, 90, 270, tx", 5)
     placed = replace(plan.artifact, map_grid=MapGrid(5, plan.artifact.grid_pitch_m))
     assumed = Assumed(order="serpentine@plate")
-    grounds = [planned_ground(artifact, plan.views, planned_system(artifact, plan.views), assumed)
+    grounds = [planned_ground(artifact, plan.views, assumed)
                for artifact in (plan.artifact, placed)]
     for one, other in zip(*(ground.visits for ground in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
@@ -27,7 +26,7 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
 def test_a_check_stop_is_approached_as_its_place_beside_the_mark_tells():
     plan = plan_of("0, 90, tx", 5)
     views = [replace(view, check_marks=1, check_offset_m=2e-5) for view in plan.views]
-    ground = planned_ground(plan.artifact, views, planned_system(plan.artifact, views), Assumed())
+    ground = planned_ground(plan.artifact, views, Assumed())
     for view, visits in zip(views, ground.visits, strict=True):
         off = np.flatnonzero(visit_sequence(plan.artifact, view).aside_m.any(axis=0))
         # from the mark in the last corner to +x of that in the middle, then to its -x, +y and -y
