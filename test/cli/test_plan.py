@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from selfcal_ros.cli import plan as plan_verb
 from selfcal_ros.cli import terminal
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.plan import field_note
@@ -20,6 +21,28 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_from_dict
 
 PLANS = sorted((Path(__file__).parents[2] / "config" / "plans").glob("*.yaml"))
+
+
+def once(function):
+    """Return a function that finds once what several tests ask of a plan."""
+    known = {}
+
+    def found(*args, **how):
+        asked = repr((args, how))
+        if asked not in known:
+            known[asked] = function(*args, **how)
+        return known[asked]
+    return found
+
+
+ONCE = {name: once(getattr(plan_verb, name))
+        for name in ("check_plan", "predict_plan", "_judge", "plan_budget")}
+
+
+@pytest.fixture(autouse=True)
+def judged_once(monkeypatch):
+    for name, found in ONCE.items():
+        monkeypatch.setattr(plan_verb, name, found)
 
 
 def shipped(name):
