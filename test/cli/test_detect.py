@@ -4,6 +4,7 @@
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import mcap.reader
@@ -68,6 +69,13 @@ def detect(bag, output, *more):
     return main(["detect", str(bag), "-o", str(output), *OPTIONS, *more])
 
 
+@pytest.fixture(scope="module")
+def found(bag):
+    """Return the bag of what is found in the images."""
+    assert detect(bag, bag.parent / "found") == 0
+    return bag.parent / "found"
+
+
 def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys):
     assert detect(bag, tmp_path / "found", "--json") == 0
     counts = json.loads(capsys.readouterr().out)["counts"]
@@ -88,15 +96,14 @@ def test_a_camera_that_is_turned_otherwise_is_noticed(bag, tmp_path, wrong):
     assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (2, 5)
 
 
-def test_other_topics_are_unchanged_and_images_left_out(bag, tmp_path):
-    assert detect(bag, tmp_path / "found") == 0
+def test_other_topics_are_unchanged_and_images_left_out(bag, found):
     for topic in (f"/{ENCODER_TOPIC}", "/selfcal/view_command"):
-        assert contents(tmp_path / "found", topic) == contents(bag, topic) != []
+        assert contents(found, topic) == contents(bag, topic) != []
     images = contents(bag, "/stage/image")
-    found = contents(tmp_path / "found", f"/{DETECTION_TOPIC}")
-    assert [stamp for stamp, _ in found] == [stamp for stamp, _ in images]
-    assert contents(tmp_path / "found", "/stage/image") == []
-    assert (tmp_path / "found" / "truth.json").read_bytes() == (bag / "truth.json").read_bytes()
+    marks = contents(found, f"/{DETECTION_TOPIC}")
+    assert [stamp for stamp, _ in marks] == [stamp for stamp, _ in images]
+    assert contents(found, "/stage/image") == []
+    assert (found / "truth.json").read_bytes() == (bag / "truth.json").read_bytes()
 
 
 def rewritten(bag, target, change, space=""):
@@ -195,15 +202,14 @@ def test_a_recording_that_is_in_the_bag_twice_is_refused(bag, tmp_path, capsys):
     assert err.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
-def test_parameters_come_from_a_file_of_the_nodes(bag, tmp_path):
+def test_parameters_come_from_a_file_of_the_nodes(bag, found, tmp_path):
     (tmp_path / "nodes.yaml").write_text(
         "mark_detector: {ros__parameters: {pixel_size: 3.0e-6, mark_size: 60.0e-6, turn: 30.0,"
         " mirror: true}}")
-    assert detect(bag, tmp_path / "a") == 0
     assert main(["detect", str(bag), "-o", str(tmp_path / "b"), "--params",
                  str(tmp_path / "nodes.yaml")]) == 0
-    found = [contents(tmp_path / name, f"/{DETECTION_TOPIC}") for name in "ab"]
-    assert found[0] == found[1]
+    marks = [contents(each, f"/{DETECTION_TOPIC}") for each in (found, tmp_path / "b")]
+    assert marks[0] == marks[1]
 
 
 def test_topics_of_foreign_types_are_kept(bag, tmp_path):
@@ -224,62 +230,59 @@ def test_topics_of_foreign_types_are_kept(bag, tmp_path):
     assert "/odd" in (tmp_path / "found" / "metadata.yaml").read_text()
 
 
-def pictures(tmp_path, **changes):
-    """Write the simulated images as PNG files; return their folder and the plan."""
-    data = yaml.safe_load(SIM) | changes
-    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(data))
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(data["plan"]))
-    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "pictures"),
-                 "--png"]) == 0
-    return tmp_path / "pictures"
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Return a folder with the images as files, what is found in them, and its result."""
+    folder = tmp_path_factory.mktemp("files")
+    images = folder / "pictures"
+    (folder / "sim.yaml").write_text(SIM)
+    (folder / "plan.yaml").write_text(yaml.safe_dump(yaml.safe_load(SIM)["plan"]))
+    assert main(["simulate", str(folder / "sim.yaml"), "-o", str(images), "--png"]) == 0
+    assert detect(images, folder / "found", "--positions", str(images / "positions.csv"),
+                  "--plan", str(folder / "plan.yaml")) == 0
+    assert main(["solve", str(folder / "found"), "-o", str(folder / "R.json"),
+                 "--force"]) in (0, 5)
+    return folder
 
 
-def test_a_folder_of_files_gives_the_detections_of_the_bag(bag, tmp_path):
-    folder = pictures(tmp_path)
-    assert len(list(folder.glob("*.png"))) == 140
-    assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
-                  "--plan", str(tmp_path / "plan.yaml")) == 0
-    assert detect(bag, tmp_path / "of_bag") == 0
+def test_a_folder_of_files_gives_the_detections_of_the_bag(found, files):
+    assert len(list((files / "pictures").glob("*.png"))) == 140
     values = [[own_values(data) for _, data in contents(
-        tmp_path / name, f"/{DETECTION_TOPIC}")] for name in ("found", "of_bag")]
+        each, f"/{DETECTION_TOPIC}")] for each in (files / "found", found)]
     assert values[0] == values[1]
     for topic, kind in INPUT_TOPICS.items():
-        for time, data in contents(tmp_path / "found", f"/{topic}"):
+        for time, data in contents(files / "found", f"/{topic}"):
             stamp = store_with(kind).deserialize_cdr(data, kind).header.stamp
             assert stamp.sec * 10**9 + stamp.nanosec == time
-    with (tmp_path / "found" / "metadata.yaml").open() as file:
+    with (files / "found" / "metadata.yaml").open() as file:
         topics = yaml.safe_load(file)["rosbag2_bagfile_information"]["topics_with_message_count"]
     latched = [one["topic_metadata"]["name"] for one in topics if "transient_local" in str(
         one["topic_metadata"]["offered_qos_profiles"])]
     assert latched == [f"/{COMMAND_TOPIC}"]
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"),
-                     "--force"]) in (0, 5)
-    result, truth = read_json(tmp_path / "R.json"), read_json(folder / "truth.json")
+    result, truth = read_json(files / "R.json"), read_json(files / "pictures" / "truth.json")
     for axis in ("gx", "gy"):
         away = np.array(result["error_map"][axis], float) - truth[axis]
         assert (np.abs(away) < 5 * np.array(result["error_map"][f"u_{axis}"], float)).all()
 
 
-def test_the_times_of_files_are_those_of_the_table_and_unknown_without(tmp_path):
-    folder = pictures(tmp_path)
+def test_the_times_of_files_are_those_of_the_table_and_unknown_without(files, tmp_path):
+    folder = files / "pictures"
     heading, *rows = (folder / "positions.csv").read_text().splitlines()
     (tmp_path / "timed.csv").write_text("\n".join([f"{heading},time", *(
         f"{row},2026-11-21T10:{10 + number // 60}:{number % 60:02}.5+01:00"
         for number, row in enumerate(rows))]))
-    found = {}
-    for name, table in (("timed", tmp_path / "timed.csv"), ("plain", folder / "positions.csv")):
-        assert detect(folder, tmp_path / name, "--positions", str(table),
-                      "--plan", str(tmp_path / "plan.yaml")) == 0
-        assert main(["solve", str(tmp_path / name), "-o", str(tmp_path / "R.json"),
-                     "--force"]) in (0, 5)
-        found[name] = read_json(tmp_path / "R.json")
-    made = found["timed"]["provenance"]
+    assert detect(folder, tmp_path / "timed", "--positions", str(tmp_path / "timed.csv"),
+                  "--plan", str(files / "plan.yaml")) == 0
+    assert main(["solve", str(tmp_path / "timed"), "-o", str(tmp_path / "R.json"),
+                 "--force"]) in (0, 5)
+    timed, plain = (read_json(each / "R.json") for each in (tmp_path, files))
+    made = timed["provenance"]
     assert made["first_exposure"] == "2026-11-21T09:10:00.500+00:00"
     assert made["last_exposure"] == "2026-11-21T09:12:19.500+00:00"
     assert made["duration_s"] == 139
-    made = found["plain"]["provenance"]
+    made = plain["provenance"]
     assert "first_exposure" not in made and made["duration_s"] is None
-    assert found["timed"]["error_map"]["gx"] == found["plain"]["error_map"]["gx"]
+    assert timed["error_map"]["gx"] == plain["error_map"]["gx"]
 
 
 def own_values(data):
@@ -323,27 +326,27 @@ def test_a_table_without_rows_is_no_data(tmp_path, capsys):
     assert not (tmp_path / "found").exists()
 
 
-def test_damaged_files_are_one_line_each(tmp_path, capsys):
-    folder, plan = pictures(tmp_path), tmp_path / "plan.yaml"
-    files = sorted(folder.glob("*.png"))
-    files[4].write_bytes(b"no image")
-    Image.fromarray(np.zeros((50, 60), np.uint8)).save(files[6])
+def test_damaged_files_are_one_line_each(files, tmp_path, capsys):
+    folder, plan = shutil.copytree(files / "pictures", tmp_path / "p"), files / "plan.yaml"
+    images = sorted(folder.glob("*.png"))
+    images[4].write_bytes(b"no image")
+    Image.fromarray(np.zeros((50, 60), np.uint8)).save(images[6])
     assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
                   "--plan", str(plan)) == 0
     damaged, other_size = capsys.readouterr().err.splitlines()
-    assert f"{files[4].name}: not an image of a known kind, or damaged; give PNG" in damaged
-    assert f"{files[6].name}: 60 x 50 pixels, but earlier images have 72 x 64" in other_size
+    assert f"{images[4].name}: not an image of a known kind, or damaged; give PNG" in damaged
+    assert f"{images[6].name}: 60 x 50 pixels, but earlier images have 72 x 64" in other_size
 
 
-def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(tmp_path, capsys):
-    folder, plan = pictures(tmp_path), tmp_path / "plan.yaml"
-    files = sorted(folder.glob("*.png"))
-    for file in files[2:4]:
-        file.unlink()
+def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(files, tmp_path, capsys):
+    folder, plan = shutil.copytree(files / "pictures", tmp_path / "p"), files / "plan.yaml"
+    images = sorted(folder.glob("*.png"))
+    for image in images[2:4]:
+        image.unlink()
     assert detect(folder, tmp_path / "found", "--positions", str(folder / "positions.csv"),
                   "--plan", str(plan)) == 4
     line, = capsys.readouterr().err.splitlines()
-    assert f"positions.csv:4: {files[2].name} is not in {folder} (2 of 140 files are not)" in line
+    assert f"positions.csv:4: {images[2].name} is not in {folder} (2 of 140 files are not)" in line
     assert not (tmp_path / "found").exists()
 
 
