@@ -2,6 +2,7 @@
 import io
 import json
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,10 @@ from test.support.truth import hu_plan, random_truth, simulate_measurements
 ROOT = Path(__file__).parents[2]
 
 
-def calibrated(rng, sigma_m=2e-8, sigma_rad=2e-5):
+@cache
+def calibrated(seed, sigma_m=2e-8, sigma_rad=2e-5):
     """Return the JSON form of a real calibration and of its truth."""
+    rng = np.random.default_rng(seed)
     artifact = Artifact(5, 0.01, 8)
     plan = hu_plan(artifact, 3)
     truth = random_truth(artifact, len(plan.views), rng)
@@ -33,7 +36,7 @@ def calibrated(rng, sigma_m=2e-8, sigma_rad=2e-5):
 
 @pytest.fixture
 def folder(tmp_path):
-    result, truth = calibrated(np.random.default_rng(4))
+    result, truth = calibrated(4)
     write_json(tmp_path / "result.json", result)
     write_json(tmp_path / "truth.json", truth)
     return tmp_path
