@@ -16,7 +16,7 @@ from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.ophyd import OphydMachine
 from test.machine.test_measuring import away_from
-from test.support.cells import QUIET, Agreeing, write_cell
+from test.support.cells import FEW, QUIET, Agreeing, write_cell
 
 for library in ("ophyd", "epics", "caproto"):
     pytest.importorskip(library, exc_type=ImportError)
@@ -54,7 +54,7 @@ def measure(folder):
 
     beamline = sys.modules["beamline"] = types.ModuleType("beamline")
     beamline.x, beamline.y = (EpicsMotor(f"stage:{name}", name=name) for name in "xy")
-    cell, simulated = write_cell(folder, camera=True, simulation=QUIET)
+    cell, simulated = write_cell(folder, plan=FEW, camera=True, simulation=QUIET)
     machine = OphydMachine("beamline:x", "beamline:y")
 
     def image():
