@@ -95,8 +95,7 @@ def damaged(folder, data):
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
-@pytest.mark.parametrize("change", [1, -1, 700, -700, 10**6, 2**62, -10**6])
-def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, options, change):
+def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, options):
     path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
         tmp_path / "x.mcap", events)
     data = path.read_bytes()
@@ -105,10 +104,11 @@ def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, 
     chunks = [at for opcode, at, _ in records(data) if opcode == Opcode.CHUNK]
     assert len(chunks) > 5
     for at in (chunks[0], chunks[3], chunks[-1]):
-        found, lost = damaged(tmp_path, relength(data, at, change))
-        assert found == whole
-        assert len(lost) <= 1 and (lost or change > 0)
-        assert not lost or lost[0].startswith(f"the file is damaged from byte {at} to ")
+        for change in (1, -1, 700, -700, 10**6, 2**62, -10**6):
+            found, lost = damaged(tmp_path, relength(data, at, change))
+            assert found == whole, change
+            assert len(lost) <= 1 and (lost or change > 0)
+            assert not lost or lost[0].startswith(f"the file is damaged from byte {at} to ")
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
