@@ -73,12 +73,17 @@ def plan_file(folder: Path, plan: Plan) -> str:
     return str(path)
 
 
-def small_bag(folder: Path, plan: Plan | None = None, **faults: float) -> Path:
-    """Write a simulated bag with noise and faults, and return its folder."""
+def small_bag(folder: Path, plan: Plan | None = None, *, correlation: float = 0.0,
+              **faults: float) -> Path:
+    """Write a simulated bag with noise and faults, and return its folder.
+
+    The errors of the stage are correlated over as many pitches.
+    """
     plan_file(folder, plan or small_plan())
     simulation = folder / "simulation.yaml"
     simulation.write_text(yaml.safe_dump({
         "plan": "plan.yaml", "seed": 7, "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-5},
+        "truth": {"correlation": correlation},
         "faults": {"lost": 0.02, "duplicated": 0.02, "delay": 0.05, **faults}}))
     write_simulation(read_simulation(simulation), folder / "bag")
     return folder / "bag"
