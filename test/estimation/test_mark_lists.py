@@ -23,6 +23,7 @@ from selfcal_ros.reporting.words.findings import worded
 from test.support.mark_lists import lattice, rings, scatter
 from test.support.placed import SIX, THREE, dense, error_in_datum, plate, readings
 from test.support.refusals import in_words
+from test.support.results import trusted
 
 BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
@@ -105,7 +106,7 @@ def test_errors_of_stage_and_plate_lie_in_u(name):
     squares, inside, number, plates = 0.0, 0, 0, []
     for seed in range(COUNT):
         found, truth = readings(PLATES[name](), SIX, np.random.default_rng(seed))
-        result = calibrate(found, BARE)
+        result = trusted(found, BARE)
         assert result.verdict.qualified
         known = result.error_map.valid
         z = error_in_datum(result.error_map, truth) / np.stack(

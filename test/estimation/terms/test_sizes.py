@@ -23,6 +23,7 @@ from selfcal_ros.simulation.machine import Spread, random_truth
 from test.estimation.terms.test_terms import plan_of, settings
 from test.support.dense_fit import DenseFit
 from test.support.options import bare
+from test.support.results import trusted
 from test.support.truth import simulate_measurements
 
 CLEAN = Spread(encoder="independent", rotation="finite", phi_rad=1e-4)
@@ -76,7 +77,7 @@ def fitted(readings, wanted):
 
 def test_sizes_that_are_right_are_contradicted_at_the_rate_of_the_level():
     p = []
-    for seed in range(10):
+    for seed in range(7):
         _, readings = measured(seed, SIZES)
         sizes = fitted(readings, options(*(f"{n}:{s}" for n, s in SIZES.items()))).sizes
         assert {test.name for test in sizes} == set(SIZES)
@@ -160,7 +161,7 @@ def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
     raised = []
     for seed in range(8):
         _, readings = measured(seed, {"plate_scale": 3 * SIZES["plate_scale"]})
-        result = calibrate(readings, options(f"plate_scale:{SIZES['plate_scale']}"))
+        result = trusted(readings, options(f"plate_scale:{SIZES['plate_scale']}"))
         (test,) = fitted(readings, options(f"plate_scale:{SIZES['plate_scale']}")).sizes
         (term,) = result.model.terms
         assert (term.size_used is not None) == (test.p < 0.1)
@@ -183,7 +184,7 @@ def test_doubt_raises_no_size_beyond_what_is_plausible_or_shown(monkeypatch, pla
             seen += 1
             assert size < test.shown < 4 * size
             assert test.allowed < 1.000001 * max(test.shown, plausible * size)
-            verdict = calibrate(readings, options(f"plate_scale:{size}")).verdict
+            verdict = trusted(readings, options(f"plate_scale:{size}")).verdict
             assert verdict.grade is grade
             assert bool(verdict.causes) is (grade is Grade.NOT_QUALIFIED)
     assert seen

@@ -10,7 +10,6 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import model_fit
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
-from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import View
@@ -19,6 +18,7 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.options import BARE, bare, reference_length
+from test.support.results import trusted
 from test.support.truth import hu_plan, simulate_measurements
 
 N, PITCH_M, SIGMA_M = 7, 0.01, 1e-8
@@ -176,10 +176,9 @@ def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
 @pytest.mark.parametrize("options", [
     bare(uncertainty=False), bare(misalignment_model="linear"),
     bare(terms=parse_terms(["plate_scale:1e-7"], "")),
-    bare(reference=ReferenceLength("artifact", 0.0, 1e-7)),
     bare(reference=reference_length("marks", 0.0, 1e-7))])
 def test_it_is_found_whatever_else_is_asked_for(options):
-    found = calibrate(readings(follow=True, rough_m=1e-7), options).verdict
+    found = trusted(readings(follow=True, rough_m=1e-7), options).verdict
     assert found.causes[0].name == "off_sites"
     assert calibrate(readings(follow=False, rough_m=1e-7), options).verdict.grade is Grade.GOOD
 
@@ -199,7 +198,7 @@ def test_the_same_readings_tell_the_same_in_either_sense():
     """The map is mirrored, and its uncertainty with it; what the places do to it is the same."""
     whole = readings(follow=True, rough_m=1e-7)
     views = tuple(replace(view, count=np.where(view.m < 0, 1, 9)) for view in whole.views)
-    one, two = (calibrate(replace(whole, views=views, sense=sense), BARE) for sense in Sense)
+    one, two = (trusted(replace(whole, views=views, sense=sense), BARE) for sense in Sense)
     assert not np.allclose(one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0)
     (first, *_), (second, *_) = one.verdict.causes, two.verdict.causes
     assert (first.name, first.size, first.u) == (second.name, pytest.approx(second.size),
