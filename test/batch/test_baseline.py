@@ -12,13 +12,13 @@ import pytest
 from selfcal_ros.batch.course import compared, probability, sentence
 from selfcal_ros.batch.table import csv_text
 from selfcal_ros.cli.main import main
-from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.maps import compare
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
-from test.support.options import bare
+from test.support.options import BARE
 from test.support.sessions import small_bag
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
@@ -33,7 +33,7 @@ def result_of(noise_seed, *, moved_m=0.0, artifact=PLATE):
     rng = np.random.default_rng([2, noise_seed])
     readings = simulate_measurements(replace(truth, g=g), hu_plan(artifact, 4), rng, sigma_m=20e-9,
                                      sigma_theta_rad=2e-5)
-    return calibrate(readings, bare(causes=False))
+    return solve_joint(readings, BARE).result
 
 
 def shelf(folder, results):
@@ -65,9 +65,9 @@ def test_maps_that_changed_are_named_and_no_others(tmp_path):
 
 
 def test_a_stable_machine_is_rarely_named(tmp_path):
-    """p of 60 maps against maps of their own: about 5 % below 0.05, and not more."""
-    p = [probability(compare(result_of(seed), result_of(1000 + seed))) for seed in range(60)]
-    assert sum(value < 0.05 for value in p) <= 7
+    """p of 40 maps against maps of their own: about 5 % below 0.05, and not more."""
+    p = [probability(compare(result_of(seed), result_of(1000 + seed))) for seed in range(40)]
+    assert sum(value < 0.05 for value in p) <= 6
 
 
 def test_bags_without_a_map_remain_as_they_are(tmp_path):

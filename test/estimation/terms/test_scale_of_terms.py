@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceLength
@@ -77,7 +78,7 @@ def test_errors_of_the_scale_are_as_large_as_their_uncertainty():
     chosen, rng = options(f"plate_scale:{SIZE}"), np.random.default_rng(7)
     drawn = [measured(seed, rng.normal(0, SIZE, len(VIEWS)), sigma=2e-9) for seed in range(60)]
     u = u_of_scale(drawn[0][1], chosen)  # of all: the noise is small beside the size
-    errors = [scale_error(calibrate(readings, chosen), truth) for truth, readings in drawn]
+    errors = [scale_error(solve_joint(readings, chosen).result, truth) for truth, readings in drawn]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(u, rel=0.3)
 
 
