@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calls of drivers and classes of others: whatever they raise becomes a `MachineError`."""
 
+import sysconfig
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,9 @@ from typing import Any
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.portable import Ended
+
+LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
+"""Folders of code in which nobody looks for a mistake of their own."""
 
 
 def called(where: str, function: Callable[..., Any], *values: Any,
@@ -27,16 +31,18 @@ def called(where: str, function: Callable[..., Any], *values: Any,
     Raises
     ------
     MachineError
-        For any error that is not one of this package, with the line of Python that raised it; also
-        for the end of the program, unless a signal asks for that.
+        For any error that is not one of this package, with the last line of Python outside the
+        libraries that led to it; also for the end of the program, unless a signal asks for that.
     """
     try:
         return function(*values, **more)
     except (SelfcalError, ModuleNotFoundError, Ended):
         raise
     except (Exception, SystemExit) as error:
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        in_python = frame.filename != __file__  # else it was raised by a library in C
-        place = f" ({Path(frame.filename).name}, line {frame.lineno})" if in_python else ""
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__)
+                  if frame.filename != __file__]  # none if a library in C raised it
+        of_user = [frame for frame in frames if not frame.filename.startswith(LIBRARIES)]
+        place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})"
+                        for frame in (of_user or frames)[-1:])
         raise MachineError(f"{type(error).__name__}: {first_line(error)}{place}", where,
                            remedy) from error

@@ -306,7 +306,8 @@ def class_of(cell: Cell) -> Any:
         raise InputError(where, f"the module '{module}' fails: {type(error).__name__}: "
                          f"{first_line(error)}", "correct it") from error
     if not hasattr(found, name):
-        raise InputError(where, f"the module '{module}' has no '{name}'",
+        path = getattr(found, "__file__", None) or "built into Python"
+        raise InputError(where, f"the module '{module}' ({path}) has no '{name}'",
                          known_are(name, [key for key in vars(found) if not key.startswith("_")]))
     return getattr(found, name)
 

@@ -53,6 +53,7 @@ def leaves(parser, words=()):
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_help_has_an_example_that_is_understood(verb):
     for words, leaf in leaves(build_parser(verb)):
+        assert words in EXAMPLES, f"add '{words}' to EXAMPLES in cli/verbs.py"
         example = EXAMPLES[words]
         assert example.startswith(f"selfcal {words} ") and f"\n  {example}\n" in leaf.format_help()
         build_parser(verb).parse_args(shlex.split(example)[1:])

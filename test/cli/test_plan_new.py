@@ -21,6 +21,7 @@ ONCE = {name: cache(getattr(plan_new, name))  # the same plates in all tests
         for name in ("best_plan", "_u_of_reading", "_budget", "_next")}
 
 CELLS = Path(__file__).parents[2] / "config/cells"
+PAGES = Path(__file__).parents[2] / "docs/start"
 
 
 def new(*options):
@@ -81,10 +82,13 @@ def test_the_cell_of_every_machine_can_be_read(machine):
     assert cell.machine == machine and cell.limits["x"] == (-0.025, 0.025)
     assert cell.placing == ("robot" if machine == "simulated" else "person")
     assert read_plan("plan.yaml").plan_id == "plan"
-    shipped = [read_yaml(path) for path in CELLS.glob("*.yaml")]
-    own = [data[machine] for data in shipped if data["machine"] == machine]
+    shipped = {path: read_yaml(path) for path in CELLS.glob("*.yaml")}
+    own = {path: data[machine] for path, data in shipped.items() if data["machine"] == machine}
     assert own, f"add an example with `machine: {machine}` to config/cells"
-    assert read_yaml("cell.yaml")[machine].keys() <= own[0].keys()
+    assert read_yaml("cell.yaml")[machine].keys() <= next(iter(own.values())).keys()
+    pages = "".join(page.read_text() for page in PAGES.glob("machine*.md"))
+    assert any(f"config/cells/{path.name}" in pages for path in own), (
+        f"describe it in docs/start/machine_{machine}.md and link that from machines.md")
 
 
 @pytest.mark.parametrize(("options", "line"), [

@@ -70,9 +70,12 @@ def test_a_class_beside_the_file_gets_the_keys_under_its_name(tmp_path):
 @pytest.mark.parametrize(("text", "said"), [
     ("machine: simulatd\n", "there is no machine 'simulatd'; did you mean 'simulated'?"),
     ("machine: no_such_module:Mine\n", "put no_such_module.py beside cell.yaml"),
-    ("machine: own_stage:Yours\n", "the module 'own_stage' has no 'Yours'"),
+    ("machine: own_stage:Yours\n", "own_stage.py) has no 'Yours'"),
     ("machine: own_stage:Mine\nMine: {prot: 1}\n", "prot: unknown key; did you mean 'port'?"),
     ("machine: own_stage:Mine\n", "Mine: the key 'port' is missing"),
+    ("machine: code:Stage\n", "code.py) has no 'Stage'"),  # of Python, not beside the file
+    ("machine: own_stage:Far\n", "JSONDecodeError: Expecting value: line 1 column 1 (char 0) "
+     "(own_stage.py, line "),
     ("machine: own_stage:Half\n", "own_stage:Half has no 'move_to'"),
     ("machine: own_stage:Odd\n", "the axes of own_stage:Odd are ('y', 'x')"),
     ("machine: broken_stage:Mine\n", "ZeroDivisionError"),
@@ -80,6 +83,7 @@ def test_a_class_beside_the_file_gets_the_keys_under_its_name(tmp_path):
 def test_a_machine_that_cannot_be_had(tmp_path, text, said):
     (tmp_path / "own_stage.py").write_text(
         OWN + "\nclass Half:\n    axes = ('x', 'y')\n    position = 1\n"
+        "\nclass Far(Mine):\n    def __init__(self): import json; json.loads('')\n"
         "\nclass Odd(Mine):\n    axes = ('y', 'x')\n    def __init__(self): pass\n")
     (tmp_path / "broken_stage.py").write_text("1 / 0\n")
     (tmp_path / "lacking_stage.py").write_text("import not_installed_anywhere\n")

@@ -56,6 +56,12 @@ def test_every_equation_that_the_code_cites_exists():
     assert cited > 20
 
 
+def test_every_page_is_in_the_menu_of_the_site():
+    menu = re.findall(r"^ +- (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert set(menu) == pages, "list it in mkdocs.yml"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_the_site_reads_a_page_as_github_does(page):
     """Python-Markdown shows a fence of two words, or a list right below a line, as it stands."""

@@ -53,7 +53,6 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.estimation.verdict.untold import untold_effects
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
@@ -355,7 +354,7 @@ def _views_findings(measurements: Measurements) -> Iterator[Finding]:
     used: Counter[str] = Counter()
     rejected: dict[str, Counter[str]] = {}
     for view in measurements.views:
-        name = without_cell(view.view.name)
+        name = view.view.plan_view
         used[name] += view.used
         rejected.setdefault(name, Counter()).update(view.rejected)
     for name, counts in rejected.items():
