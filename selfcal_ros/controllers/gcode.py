@@ -25,6 +25,8 @@ VALUE = r"([-+]?(?:\d+\.?\d*|\.\d+))"
 WORD = re.compile(rf"([A-Za-z])[ \t]*{VALUE}|(;.*|\([^()]*\))|[ \t]+", re.ASCII)
 PRINTER_WORD = re.compile(rf"([A-Z]){VALUE}?|(;.*)| +", re.ASCII)
 """Letter, value and comment."""
+EXTRUDES = re.compile(r"^ *G1\b[^;\n]*E", re.MULTILINE)
+"""A line that extrudes: in a program with such lines, those without E are travels."""
 CONTROL = r"[\x00-\x08\x0a-\x1f\x7f]"
 FORBIDDEN = {"linuxcnc": rf"{CONTROL}|[(;]\s*(?i:py|abort)", "grbl": r"[!?~]|[^ -~\t]"}
 """Comments that run Python or stop; characters that are obeyed at once, even in comments."""
@@ -81,6 +83,7 @@ class ProgramLine:
 def corrected_program(text: str, where: str, rewriter: "Rewriter") -> str:
     """Return a program with corrected moves; InputError names a line that cannot be corrected."""
     out: list[str] = []
+    rewriter.prints = rewriter.dialect in PRINTERS and bool(EXTRUDES.search(text))
     for number, line in enumerate(text.split("\n"), 1):
         end = "\r" * line.endswith("\r")
         lines = rewriter.line(line.removesuffix("\r"), f"{where}:{number}")
@@ -123,6 +126,7 @@ class Rewriter:
         self.dialect = dialect
         self._codes = DIALECTS[dialect]
         self._printer = dialect in PRINTERS
+        self.prints = False
         self._modes = {"unit": "G21"} if self._printer else {}
         self._motion: Code | None = None
         self._at = dict.fromkeys("XYZE", math.nan)  # as programmed; nan if not known
@@ -290,11 +294,12 @@ class Rewriter:
         """Return the lines of a move in XY."""
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
-        travels = act.does in ("rapid", "hole") or (self._printer and act.does == "line"
-                                                    and not line.named("E"))
+        travels = act.does in ("rapid", "hole") or (
+            act.does == "line" and not line.named("E") and (
+                self.prints or (self._printer and act.name == "G0")))
         if not cmath.isfinite(end_m if travels else start_m + end_m):
             self._refuse("the position before this line is not known", "write an absolute move of "
-                         "X and Y before it" + " with G0" * (not self._printer))
+                         "X and Y before it" + " with G0" * (not self.prints))
         limit_m = (1 - OF_SAMPLES) * self._tolerance_m
         if act.does == "arc":
             centre_m = start_m + complex(line.number("I"), line.number("J")) * unit_m

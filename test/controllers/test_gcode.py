@@ -285,6 +285,8 @@ grbl | +G0 X0 Y0 // G2 X10.0011 Y0 I5 | 5: the arc ends at 1.000220 times its ra
 grbl | +G0 X0 Y0 // G2 X0 Y0.0001 I5 | 5: the arc ends
 grbl | +G0 X0 Y0 // G2 X10 I5 P2 | 5: P is not a word of G2; write each repeat, turn
 grbl | +G1 X5 Y5 | 4: the position before this line is not known
+marlin | +G1 X5 Y5 | 4: the position before this line is not known; write an absolute move of X and
+klipper | +G0 X0 Y0 // G28 // G1 X5 Y5 ; E1 | 6: the position before this line is not known
 marlin | +G1 X5 Y5 E1 | 4: the position before this line is not known
 marlin | +G0 X0 Y0 // G1 X40 Y20 E1 | 5: E before this line is not known
 linuxcnc | +G61 // G0 X0 Y0 // G2 I5 G64 P0.01 Q0 | 6: G2 G64 in one line; write a line
