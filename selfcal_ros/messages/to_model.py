@@ -323,6 +323,9 @@ def _refuse_not_finite(grids: dict[str, np.ndarray], known: np.ndarray,
         if bad:
             raise InputError(ERROR_MAP_TOPIC, f"{name} is not finite at {bad} of the "
                              f"{int(known.sum())} valid sites", "correct the publisher")
+    for name in ("u_gx", "u_gy"):
+        if (grids[name] < 0).any():
+            raise InputError(ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher")
     if np.isinf(g_theta).any():
         raise InputError(ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher")
     if not known.any() or (len(g_theta) and np.isnan(g_theta).all()):

@@ -125,6 +125,8 @@ class CompensatingSession:
         message, summary = self._map, self._summary
         if not message.qualified:
             return f"{_source(message)} is not qualified"
+        if not message.identifiable:
+            return f"{_source(message)} is said to be qualified and not identified"
         if summary is None or not self._is_of_one_result():
             return f"no selfcal/summary says yet whether {_source(message)} is complete"
         if not summary.qualified:

@@ -234,6 +234,7 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
 
 @pytest.mark.parametrize("the_map, the_summary, why", [
     ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
+    ({"identifiable": False}, {}, "plan demo, run 7 is said to be qualified and not identified"),
     ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
     ({}, {"views_done": 3}, "plan demo, run 7 contains 3 of 4 views"),
     ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
@@ -364,6 +365,7 @@ MILLIRADIAN_REACH = 1e-3 / np.hypot(0.02, 0.02)
 @pytest.mark.parametrize("changes, why", [
     ({"gx": np.zeros(3)}, "gx has 3 values, the plate 25"),
     ({"gx": with_value(ONE.gx, math.nan)}, "gx is not finite at 1 of the 25 valid sites"),
+    ({"u_gy": with_value(ONE.gy, -1e-9)}, "u_gy is negative"),
     ({"gy": with_value(ONE.gy, -math.inf)}, "gy is not finite at 1 of the 25 valid sites"),
     ({"g_theta": with_value(ONE.g_theta, math.inf)}, "g_theta is infinite"),
     ({"g_theta": np.full(8, math.nan)}, "the error of no site or of no line is known"),
