@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -333,13 +334,14 @@ def load_cals(paths: Sequence[str]) -> model.CalFile:
     Raises
     ------
     InputError
-        As `load_cal`; or if a file is named twice.
+        As `load_cal`; or if two files are one, or alike.
     """
-    twice = next((path for number, path in enumerate(paths) for other in paths[:number]
-                  if os.path.realpath(path) == os.path.realpath(other)), None)
-    if twice is not None:
-        raise InputError(twice, "is named twice, which would add it twice", "name it once")
     files = [load_cal(path) for path in paths]
+    texts = [Path(path).read_bytes() for path in paths]
+    for number, (path, text) in enumerate(zip(paths, texts, strict=True)):
+        if text in texts[:number]:
+            raise InputError(path, f"is the same as {paths[texts.index(text)]}, and would be added "
+                             "twice", "name it once")
     return model.CalFile(", ".join(paths), *(
         tuple(item for cal in files for item in getattr(cal, name))
         for name in ("tables", "findings", "comments")))

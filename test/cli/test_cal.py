@@ -229,9 +229,11 @@ def test_files_that_are_loaded_together_are_added(run, tmp_path):
             f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n")
     code, out, _ = run("eval", "0.cal", "1.cal", "--position", "1=15")
     assert code == 0 and json.loads(out) == {"1": (2 + 5) / 2 + (-1 + 1) / 2}
-    code, out, err = run("eval", "0.cal", "1.cal", "./0.cal", "--position", "1=15")
-    assert (code, out) == (2, "")
-    one_line(err, "./0.cal: is named twice")
+    (tmp_path / "copy.cal").write_bytes((tmp_path / "0.cal").read_bytes())
+    for again in ("0.cal", "./0.cal", "copy.cal"):
+        code, out, err = run("eval", "0.cal", "1.cal", again, "--position", "1=15")
+        assert (code, out) == (2, "")
+        one_line(err, f"{again}: is the same as 0.cal, and would be added twice")
 
 
 def test_verify_loads_all_files(run):
