@@ -163,7 +163,7 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
 
     `without`: observability and prediction without terms.
     """
-    terms = PlannedTerms(plan, model, assumed)
+    terms = PlannedTerms(plan, model, assumed, sizes)
     seen = terms.told(without[0])
     joint = terms.predicted(without[1]) if seen.identifiable else None
     return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)

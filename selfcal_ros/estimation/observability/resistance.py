@@ -115,15 +115,21 @@ class PlannedTerms:
         Terms to be estimated with the map.
     assumed : Assumed
         Noise, stop errors, visiting order.
+    against : iterable of str, optional
+        Further terms that are checked: those without a nominal size.
     """
 
     @one_thread()
-    def __init__(self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed) -> None:
+    def __init__(self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed,
+                 against: Iterable[str] = ()) -> None:
         plan = predicted_on(plan)
         self.model, self.assumed = tuple(model), assumed
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
-        sized = [ModelTerm(name, size) for name, size in nominal_sizes().items()]
+        names = {*nominal_sizes(), *against, *(term.name for term in self.model)}
+        # with any size all columns exist; their own is in `with_terms`
+        sized = [ModelTerm(name, block.nominal or 1.0) for name, block in blocks().items()
+                 if name in names]
         self.every = planned_equations(plan, system, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
@@ -250,7 +256,7 @@ def check_terms(planned: PlannedTerms, sizes: Mapping[str, float],
     """Return the checks against all terms; `sizes` override the nominal ones."""
     own = {term.name: term.size for term in planned.model if not term.free}
     wanted = nominal_sizes() | own | dict(sizes)
-    return tuple(planned.check(name, wanted[name], level) for name in nominal_sizes())
+    return tuple(planned.check(name, wanted[name], level) for name in blocks() if name in wanted)
 
 
 def _n_unseen(equations: TermEquations) -> int:

@@ -16,7 +16,13 @@ from scipy.special import ndtri
 from selfcal_ros.blocks import block_of
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data, planned_readings
 from selfcal_ros.estimation.normal.equations import NormalEquations, lines_of
-from selfcal_ros.estimation.terms.columns import Column, TermColumns, WithinMarks, term_columns
+from selfcal_ros.estimation.terms.columns import (
+    Column,
+    LineColumns,
+    TermColumns,
+    WithinMarks,
+    term_columns,
+)
 from selfcal_ros.estimation.terms.equations import (
     ProjectedColumns,
     TermEquations,
@@ -201,11 +207,14 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
                     for column, here in zip(known.columns, rows, strict=True) if here)
     inner = known.within
     within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
-    part = every.projected
+    part, of_lines = every.projected, rows[known.lines.at]
+    lines = LineColumns(np.cumsum(rows)[known.lines.at[of_lines]] - 1,
+                        known.lines.values[of_lines])
     return TermEquations(
-        every.system, TermColumns(columns, known.shapes.part(rows), within, known.at),
+        every.system, TermColumns(columns, known.shapes.part(rows), within, known.at, lines),
         ProjectedColumns(lambda: part.fields[:, rows], part.parameters[:, rows],
-                         part.gram[np.ix_(rows, rows)], part.turned[:, rows]), every.noise_m)
+                         part.gram[np.ix_(rows, rows)], part.turned[:, rows]),
+        every.noise_m, every.line_weight)
 
 
 def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
@@ -216,4 +225,5 @@ def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
 
 
 def _first(column: Column) -> bool:
-    return column.view == 0 and block_of(column.term).of_plate
+    block = block_of(column.term)
+    return column.view == 0 and (block.of_plate or block.of_lines)

@@ -165,6 +165,23 @@ def test_a_plate_bent_in_one_view_only(views, worst):
     assert max(found) == pytest.approx(worst, abs=0.05)
 
 
+@pytest.mark.parametrize("text", ["line_scale", "line_eccentricity", "rotation", "drift",
+                                  "line_scale:0.1", "plate_shape,line_eccentricity:1e-5"])
+def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
+    """Also those for which plans are not judged otherwise, and those of the lines."""
+    plan = plan_of("0, 90, tx", 5, count=8, line=True)
+    terms, assumed = parse_terms(text.split(","), ""), Assumed()
+    planned = PlannedTerms(plan, terms, assumed, ["line_scale"])
+    alone = planned_equations(plan, planned_system(plan.artifact, plan.views), terms, assumed)
+    assert planned.of_model.n == alone.n > 0
+    assert planned.of_model.unseen(planned.of_model.free).shape[1] == alone.unseen(
+        alone.free).shape[1]
+    assert planned.of_model.columns.columns == alone.columns.columns
+    named = [found.name for found in check_terms(planned, {"line_scale": 0.1}, LEVEL)]
+    assert set(nominal_sizes()) < set(named)
+    assert ("line_scale" in named) and ("line_eccentricity" in named) == ("city:" in text)
+
+
 def test_the_assumed_offsets_are_misalignments_and_stop_errors():
     plan = plan_of("0, 90, tx", 31)
     exact = planned_ground(plan.artifact, plan.views, Assumed(
