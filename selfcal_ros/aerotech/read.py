@@ -338,8 +338,8 @@ def load_cals(paths: Sequence[str]) -> model.CalFile:
     """
     files = [load_cal(path) for path in paths]
     texts = [Path(path).read_bytes() for path in paths]
-    for number, (path, text) in enumerate(zip(paths, texts, strict=True)):
-        if text in texts[:number]:
+    for at, (path, text) in enumerate(zip(paths, texts, strict=True)):
+        if text in texts[:at]:
             raise InputError(path, f"is the same as {paths[texts.index(text)]}, and would be added "
                              "twice", "name it once")
     return model.CalFile(", ".join(paths), *(
