@@ -41,8 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     check = verbs.add_parser(
         "check", help="drive the cell through a short run and check its messages",
         description="Measures the 3 x 3 marks (4 along even sides) in the middle of the plate, "
-        "placed straight, and reports joints, rates, clocks, commands, rest, ids, loss, check "
-        "stops, signs. Exit code 0 if all checks pass, else 5.")
+        "turned by some 1 mrad, and reports joints, rates, clocks, commands, rest, ids, loss, "
+        "check stops, signs. Exit code 0 if all checks pass, else 5.")
     check.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plan with the plate")
     check.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
                        "of measurement_collector is used")

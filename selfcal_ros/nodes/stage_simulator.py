@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from selfcal_ros.collection.inputs import Command, EncoderSample, check_simulated
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.collection.settings.nodes import SimulatorSettings
@@ -25,6 +27,7 @@ from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.running import run
 from selfcal_ros.nodes.telling import CellNode
+from selfcal_ros.sessions.cell_check import PLAN_ID as CHECK_ID
 from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.simulation.bag import write_truth
 from selfcal_ros.simulation.spec import Simulation, camera_of, settings_of, spread_of
@@ -36,6 +39,9 @@ of its view: no message is stamped in the past."""
 IDLE_STEPS = 10
 """Time between two encoder samples while nothing is measured, over that in a view."""
 ANYWHERE = (-math.inf, math.inf)
+CHECK_TURN_RAD = 1e-3
+"""Least turn of the plate while the cell is checked: a straighter one does not show the sign of
+offset_theta."""
 
 
 class StageSimulator(CellNode[SimulatorSettings]):
@@ -75,6 +81,10 @@ class StageSimulator(CellNode[SimulatorSettings]):
         self._visitor = Visitor(
             self.machine, cell, self._time, given.seed, consecutive=given.consecutive,
             step_ns=self._step_ns, detects=self._camera is None)
+        if plan.plan_id == CHECK_ID:
+            truth = self.machine.truth
+            self.machine.truth = replace(truth, phi_rad=np.copysign(
+                np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad))
         if given.truth_path:
             write_truth(Path(given.truth_path), self.machine.truth, seed=given.seed,
                         cell=asdict(self._settings))

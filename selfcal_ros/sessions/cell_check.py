@@ -20,10 +20,14 @@ from selfcal_ros.collection.inputs import (
 )
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import printable
-from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
+from selfcal_ros.estimation.checks.wiring import (
+    sign_of_lines_is_shown,
+    wiring_faults,
+    worded,
+)
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import Measurements, RepeatMotion, ViewReadings
+from selfcal_ros.model.readings import Measurements, RepeatMotion
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.sessions.cell_faults import explaining
@@ -39,9 +43,9 @@ FOLLOWS = 0.9
 """Fraction of the variance of an offset that must follow the stage for a valid slope."""
 TURNED_DEG = 5.0
 """Turn of the offsets against the stage beyond which they are turned."""
-CLEARLY, LEAST_TURN_RAD = 0.1, 2e-4
-"""Part of the plate's turn within which lines of the other sign show its opposite, and the least
-turn for which this is not chance."""
+CLEARLY, LEAST_TURN_RAD = 0.25, 2e-4
+"""Part of the plate's turn within which lines show it or its opposite, and the least turn for which
+this is not chance."""
 ENDLESS = 1000
 """Repeats of the view that is aborted: even a fast cell is not done when ABORT arrives."""
 MOST_NAMED = 5
@@ -427,8 +431,8 @@ class CellCheck:
         self._tell("ids", not mistaken and fault is None, figure, remedy)
         self._judge_loss(progress, rejected, total)
         follows, told = self._judge_wiring(measurements, progress.check_done)
-        if follows and self.view.angular:
-            self._judge_theta(progress.readings)
+        if follows and self.view.angular and not mistaken and fault is None:
+            self._judge_theta(measurements)
         self.items[first:] = grouped(self.items[first:], "ids" if fault else "signs" * told)
 
     def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
@@ -446,24 +450,36 @@ class CellCheck:
                    "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
                    "(docs/start/cell.md)")
 
-    def _judge_theta(self, readings: ViewReadings) -> None:
+    def _judge_theta(self, measurements: Measurements) -> None:
         """Tell whether the lines show the turn of the plate that the marks show, or its opposite.
 
-        Unless the rotary encoder has another zero: then they show neither, which is no fault.
+        If the rotary encoder has another zero they show neither: then its scatter among the repeats
+        must show the sign.
         """
-        x, y = self.plate.places(readings.m, readings.n)
+        [view] = measurements.views
+        x, y = self.plate.places(view.m, view.n)
         x, y = (self.plate.grid_pitch_m * (row - row.mean()) for row in (x, y))
-        by_marks = float((x * readings.dy - y * readings.dx).sum() / (x**2 + y**2).sum())
-        by_lines = float(readings.dtheta.mean()) if len(readings.dtheta) else 0.0
-        reversed_ = (abs(by_marks) > LEAST_TURN_RAD
-                     and abs(by_lines + by_marks) < CLEARLY * abs(by_marks))
-        self._tell("theta", not reversed_,
-                   f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
-                   f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad" + (
-                       ": offset_theta has the other sign" if reversed_ else
-                       "" if abs(by_marks) > LEAST_TURN_RAD else
-                       ", too little to tell the sign: turn the plate by 1 mrad and check again"),
-                   "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise")
+        by_marks = float((x * view.dy - y * view.dx).sum() / (x**2 + y**2).sum())
+        by_lines = float(view.dtheta.mean()) if len(view.dtheta) else 0.0
+        turned = abs(by_marks) > LEAST_TURN_RAD
+        same, reversed_ = (turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks)
+                           for sign in (1, -1))
+        scatters = view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
+        shown = scatters and sign_of_lines_is_shown(measurements)
+        figure = (f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
+                  f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad")
+        if reversed_:
+            figure += ": offset_theta has the other sign"
+            remedy = "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise"
+        elif not turned:
+            remedy = "turn the plate by 1 mrad and check again"
+            figure += "" if shown else ", too little to tell the sign"
+        else:
+            enough = (abs(by_marks) + abs(by_lines)) / CLEARLY * MRAD_PER_RAD
+            remedy = ("lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
+                      f"by 1 mrad and check again; or turn it by {enough:.2g} mrad")
+            figure += "" if same or shown else ": neither the same nor the opposite turn"
+        self._tell("theta", same or (shown and not reversed_), figure, remedy)
 
     def _judge_wiring(self, measurements: Measurements, stops: int) -> tuple[bool, bool]:
         """Tell whether the offsets follow the stage; the angle only with check stops.

@@ -92,6 +92,8 @@ class FaultyCell(StageSimulator):
             event = replace(event, offset_x=seen.real, offset_y=seen.imag)
         if self.fault == "wrong ids" and is_detection and event.kind == 0:
             event = replace(event, m=event.n, n=event.m)
+        if self.fault == "reversed offset_theta" and is_detection and event.kind == 1:
+            event = replace(event, offset_theta=-event.offset_theta)
         super().tell(replace(event, stamp_ns=event.stamp_ns + shift))
 
 
@@ -200,6 +202,7 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     ("while it moves", "rest", "exposures while the stage moved"),
     ("other joints", "joints", "heard a, b, c"),
     ("wrong ids", "ids", "m and n are exchanged"),
+    ("reversed offset_theta", "theta", ": offset_theta has the other sign"),
     ("turned 90", "signs", "the offsets are turned by +90."),
     ("turned -30", "signs", "the offsets are turned by -30.")])
 def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):

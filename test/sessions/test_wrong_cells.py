@@ -36,6 +36,11 @@ class Cell(Bench):
         self.noise = np.random.default_rng(1)
         self.came = 1.0  # sign of the last motion along x
 
+    def lay(self):
+        """Place the plate turned by 1 mrad, or too straight to show the sign of the lines."""
+        super().lay()
+        self.laid[0] = 2e-5 if self.fault.endswith("straight") else 1e-3
+
     def obey(self, fields):
         """Act on a command, once."""
         view = SimpleNamespace(**fields)
@@ -99,7 +104,7 @@ class Cell(Bench):
         self.last = seen
         if self.fault == "repeats the last detection" and before is not None:
             seen = before
-        if self.fault == "theta reversed":
+        if self.fault.startswith("theta reversed"):
             seen["offset_theta"] *= -1
         if self.fault.startswith("camera turned"):
             turned = np.exp(1j * np.deg2rad(float(self.fault.split()[2]))) * (
@@ -162,6 +167,8 @@ def test_the_right_cell_passes(cell):
 
 WRONG = [
     ("theta reversed", "theta", "offset_theta has the other sign"),
+    ("theta reversed, straight", "theta", "too little to tell the sign"),
+    ("laid straight", "theta", "too little to tell the sign"),
     ("ignores ABORT", "abort", "detections later than 2 s after ABORT"),
     ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
     ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
@@ -184,7 +191,9 @@ WRONG = [
     ("another view", "ids", "the marks are those of a plate turned by 90°")]
 
 
-REMEDIES = {"arrives late": "publish each detection as soon as it is found",
+REMEDIES = {"theta reversed, straight": "turn the plate by 1 mrad and check again",
+            "laid straight": "turn the plate by 1 mrad and check again",
+            "arrives late": "publish each detection as soon as it is found",
             "pixels too large": "divide pixel_size by this factor",
             "no offsets": "measure the offset anew in each image, and publish it in m",
             "offsets 1000 times too small": "measure the offset anew in each image",
