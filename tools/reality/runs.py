@@ -10,9 +10,6 @@ from functools import cache
 import numpy as np
 from scipy.stats import binom
 
-from selfcal_ros.collection.collector import Collector
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
@@ -22,6 +19,7 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.simulation.cell import plan_events
 from selfcal_ros.simulation.machine import Truth, random_truth
+from test.support.collecting import gathered
 from test.support.truth import FIRST_STAMP_NS, simulate_measurements
 from tools.reality.cases import Case, term_cases
 from tools.reality.machines import machine_cases
@@ -138,12 +136,9 @@ def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements, tup
 def _collected(truth: Truth, case: Case, rng: np.random.Generator,
                ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the readings, and what is said of them, as `selfcal solve` has them from a bag."""
-    collector = Collector(CollectorSettings(measurement_sense=str(case.settings.sense)))
-    take = {Command: collector.add_command, Detection: collector.add_detection,
-            EncoderSample: collector.add_encoder}
-    for event in plan_events(truth, case.plan, settings=case.settings, rng=rng,
-                             start_ns=FIRST_STAMP_NS):
-        take[type(event)](event)
+    collector = gathered(plan_events(truth, case.plan, settings=case.settings, rng=rng,
+                                     start_ns=FIRST_STAMP_NS),
+                         measurement_sense=str(case.settings.sense))
     measurements, views = collector.collect()
     findings = collector.findings(measurements, views).values()
     return measurements, tuple(
