@@ -119,7 +119,7 @@ class Site:
 
 
 @pytest.mark.parametrize("cell", [
-    {"plate_moves": True}, {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
+    {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
     {"plate_moves": True, "ids": False}], ids="-".join)
 def test_it_is_calibrated_to_its_true_error(graph, tmp_path, cell):
     site = Site(graph, tmp_path, repeats=2, **cell).begin()
