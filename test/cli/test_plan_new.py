@@ -114,7 +114,7 @@ def test_nothing_is_overwritten(capsys):
     assert new(*STAGE) == 2
     assert "cell.yaml: exists already" in capsys.readouterr().err
     assert Path("cell.yaml").read_text() == "mine"
-    assert new(*STAGE, "--force") == 0
+    assert new(*STAGE, "--minutes", "30", "--force") == 0
     assert Path("cell.yaml").read_text().startswith("# From `selfcal plan new`.")
 
 
