@@ -32,6 +32,11 @@ WRONG = {  # what the plan says, where the plate lies, in which view, and what i
     "not shifted": ("0, 90, 180, tx", "0, 90, 180, 0", 3, "shifted by (+0, +0) pitches, not by ")}
 
 
+EITHER_WAY = [(name, sense) for name in WRONG for sense in Sense
+              if sense is Sense.MICROSCOPE_MOVES or name in ("clockwise", "other side")]
+"""A turn and a shift in both senses: what moves changes the sign of either alike."""
+
+
 @cache
 def read(planned, lies, sense=Sense.MICROSCOPE_MOVES):
     """Return the readings of a plate without ids that lies otherwise, and the views' names."""
@@ -39,8 +44,7 @@ def read(planned, lies, sense=Sense.MICROSCOPE_MOVES):
     return collect(cell.events, measurement_sense=str(sense))[0], names
 
 
-@pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize(("name", "sense"), EITHER_WAY)
 def test_without_ids_the_other_views_tell_how_a_plate_lies(name, sense):
     planned, lies, index, said = WRONG[name]
     readings, names = read(planned, lies, sense)
@@ -104,8 +108,7 @@ def test_the_cells_of_one_view_alone_name_no_pose():
     assert misplaced(unrepeated(replace(readings, views=dirty))) is None
 
 
-@pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize(("name", "sense"), EITHER_WAY)
 def test_ids_tell_how_a_plate_lies_by_themselves(name, sense):
     planned, lies, index, said = WRONG[name]
     cell, _ = laid(planned, lies, with_ids=True, sense=sense)
@@ -140,7 +143,7 @@ def test_it_is_told_before_a_view_is_complete():
 
 @pytest.mark.parametrize("text", ["0, 90, tx", "0, 90, 180, tx, ty"])
 def test_plates_that_lie_as_planned_are_no_finding(text):
-    for seed in range(5):
+    for seed in range(3):
         readings = collect(scene(text, with_ids=False, seed=seed, **NOISE).events)[0]
         for size in (1.0, 0.1, 0.01):
             views = tuple(replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views)
@@ -175,7 +178,7 @@ def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
 @pytest.mark.parametrize("name", PLATES)
 @pytest.mark.parametrize("sigma", [20e-9, 1e-9])
 def test_plates_off_the_lattice_that_lie_as_planned_are_no_finding(name, sigma):
-    for seed in range(3):
+    for seed in range(2):
         assert misplaced(laid_at(PLATES[name], 1, SIX[1], seed, sigma)) is None
 
 

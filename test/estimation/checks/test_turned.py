@@ -56,7 +56,7 @@ def test_without_lines_both_signs_are_possible_and_named():
         calibrate(measured(lambda x, y: (-y, x), plan=plan))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_right_offsets_are_not_refused(seed):
     """Nothing contradicts them; both signs would do, and only lines that turn alike tell them."""
     verdict = calibrate(measured(seed=seed)).verdict
