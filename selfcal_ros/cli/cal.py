@@ -27,8 +27,9 @@ from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
-from selfcal_ros.compensation.export import fill_unknown, provenance, require_plausible
+from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
+from selfcal_ros.compensation.plausible import require_plausible
 from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
 from selfcal_ros.controllers.export import place_to_look
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius

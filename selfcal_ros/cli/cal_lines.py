@@ -22,8 +22,9 @@ from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
 from selfcal_ros.aerotech.write import cal_text
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
-from selfcal_ros.compensation.export import origin_lines, require_plausible, verdict_lines
+from selfcal_ros.compensation.export import origin_lines, verdict_lines
 from selfcal_ros.compensation.frame import LENGTHS_M, UNITS_M, MachineFrame
+from selfcal_ros.compensation.plausible import require_plausible
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.model.result import CalibrationResult

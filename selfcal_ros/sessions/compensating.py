@@ -14,6 +14,7 @@ import numpy as np
 from selfcal_ros import results
 from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.compensator import Compensator, Interpolation
+from selfcal_ros.compensation.plausible import require_plausible
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
@@ -105,6 +106,8 @@ class CompensatingSession:
                 self._refuse_other_frame(message)
                 error_map = to_model.error_map(message)
                 _refuse_other_axes(error_map, _source(message))
+                require_plausible(error_map, f"the map of {_source(message)}",
+                                  "load its file with ~/load_map")
                 self._use(error_map, _source(message), to_model.stamp_ns(message),
                           str(getattr(message, "interpolation", "")))
             except InputError as error:
