@@ -7,14 +7,15 @@ Each possible fault is undone in the recorded messages, which are collected agai
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
-from math import radians
+from math import degrees, pi, radians
 
 import numpy as np
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.diagnosis import fault_text
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
 from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import wiring_faults
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.units import MM_PER_M
@@ -39,7 +40,7 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
                ) -> Fault | None:
     """Return the fault without which most of the rejected detections would be used, if any.
 
-    Of several, one whose offsets then follow the stage.
+    Of several, one whose offsets then follow the stage; all of them if nothing tells them apart.
 
     Parameters
     ----------
@@ -55,14 +56,19 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
         return standing
     total = sum(isinstance(event, Detection) for event in events)
     used, _ = _outcome(Fault("", "", command, tuple(events)), settings)
-    found, best = None, ((used + total) / 2, -np.inf)
+    found: list[Fault] = []
+    best = ((used + total) / 2, -np.inf)
     for fault in _faults(command, events, settings):
-        outcome = _outcome(fault, settings)
+        try:
+            outcome = _outcome(fault, settings)
+        except InputError:  # an even and an odd side do not lie so
+            continue
         if outcome > best:
-            found, best = fault, outcome
-        if best == (total, 0):
-            break
-    return found
+            found, best = [], outcome
+        if outcome == best:
+            found.append(fault)
+    return replace(found[0], what=", or ".join(fault.what for fault in found),
+                   remedy="; or ".join(fault.remedy for fault in found)) if found else None
 
 
 def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int]:
@@ -86,16 +92,25 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int]:
 
 def _standing(command: Command, events: Sequence[Event], settings: CollectorSettings
               ) -> Fault | None:
-    """Return the fault of a stage that is indicated at one place during the whole view."""
-    places = np.array([place for event in events if isinstance(event, EncoderSample)
-                       and (place := _place(event, settings)) is not None])
-    if not len(places) or command.artifact is None or (
-            np.ptp(places, axis=0).max() > STILL * command.artifact.grid_pitch_m):
+    """Return the fault of a stage that is indicated at one place, or turn, during the view."""
+    plate = command.artifact
+    samples = [event for event in events if isinstance(event, EncoderSample)]
+    places = np.array([place for sample in samples
+                       if (place := _place(sample, settings)) is not None])
+    if not len(places) or plate is None:
         return None
-    x, y = np.median(places, axis=0) * MM_PER_M
-    return Fault(f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
-                 "during the whole view", "move the stage to each mark, and name the joints that "
-                 "move in joint_x and joint_y", command)
+    if np.ptp(places, axis=0).max() <= STILL * plate.grid_pitch_m:
+        x, y = np.median(places, axis=0) * MM_PER_M
+        return Fault(f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
+                     "during the whole view", "move the stage to each mark, and name the joints "
+                     "that move in joint_x and joint_y", command)
+    lines = {event.k for event in events if isinstance(event, Detection) and _is_line(event)}
+    _, turns = _turns(samples, settings)
+    if len(lines) > 1 and len(turns) and np.ptp(turns) <= STILL * 2 * pi / plate.angular_count:
+        return Fault(f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
+                     "the whole view", "turn the stage to each line, and name the joint that turns "
+                     "in joint_theta", command)
+    return None
 
 
 def _place(sample: EncoderSample, settings: CollectorSettings) -> tuple[float, float] | None:
@@ -115,6 +130,7 @@ def _faults(command: Command, events: Sequence[Event], settings: CollectorSettin
     def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
         return Fault(what, remedy, command, (*samples, *detections))
 
+    yield from _counts(command, samples, seen, settings)
     yield fault("m and n are exchanged", "m counts the marks along plate x, n along plate y",
                 [replace(one, m=one.n, n=one.m) for one in seen])
     for scale, unit in ((1e3, "mm"), (1e6, "µm")):
@@ -138,7 +154,74 @@ def _faults(command: Command, events: Sequence[Event], settings: CollectorSettin
         yield Fault(what, remedy, command, (*(
             _moved(sample, settings, scale=scale, swapped=swapped, signs=signs)
             for sample in samples), *seen))
+    for what, remedy, factor in (
+            ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
+            ("theta is indicated in degrees", "publish theta in rad", radians(1.0))):
+        yield Fault(what, remedy, command, (
+            *(_turned(sample, settings, factor=factor) for sample in samples), *seen))
     yield from _placings(command, events)
+
+
+def _counts(command: Command, samples: Sequence[EncoderSample], seen: Sequence[Detection],
+            settings: CollectorSettings) -> Iterator[Fault]:
+    """Yield that marks or lines are counted otherwise."""
+    view, plate = command.view, command.artifact
+    if view is None or plate is None:
+        return
+
+    def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
+        return Fault(what, remedy, command, (*samples, *detections))
+
+    for signs, what in (((-1, 1), "m is counted against plate x"),
+                        ((1, -1), "n is counted against plate y"),
+                        ((-1, -1), "m and n are counted against plate x and y")):
+        even = [sign < 0 and size % 2 == 0 for sign, size in zip(signs, plate.shape, strict=True)]
+        yield fault(what, "m counts the marks along plate x, n along plate y", [
+            replace(one, m=signs[0] * one.m - even[0], n=signs[1] * one.n - even[1])
+            for one in seen])
+    lines = [one for one in seen if _is_line(one)]
+    if not lines or not plate.angular_count:
+        return
+    yield fault("the lines are counted clockwise", "count k counter-clockwise",
+                [replace(one, k=-one.k % plate.angular_count) for one in seen])
+    zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
+    yield Fault(
+        f"theta is indicated {degrees(zero):+.4g}° from where the lines are", "count k from the "
+        "line along plate x, and set theta to 0 where that line is read", command, (
+            *(_turned(sample, settings, zero_rad=zero) for sample in samples), *seen))
+
+
+def _other_zero(rotation_rad: float, count: int, samples: Sequence[EncoderSample],
+                lines: Sequence[Detection], settings: CollectorSettings) -> float:
+    """Return the mean difference of the indicated theta to that of the lines, rad."""
+    stamps, turns = _turns(samples, settings)
+    if not turns:
+        return 0.0
+    at = np.interp([one.stamp_ns for one in lines], stamps, turns)
+    sites = rotation_rad + 2 * pi * np.array([one.k for one in lines]) / count
+    return float(np.angle(np.exp(
+        1j * (at - Sense(settings.measurement_sense).sign * sites)).mean()))
+
+
+def _is_line(event: Detection) -> bool:
+    """Return whether a detection names an angular line."""
+    return event.kind == Kind.ANGULAR and event.has_id
+
+
+def _turns(samples: Sequence[EncoderSample], settings: CollectorSettings
+           ) -> tuple[list[int], list[float]]:
+    """Return stamps, ns, and theta, rad, of the samples that have it."""
+    told = [(sample.stamp_ns, theta) for sample in samples if (theta := dict(zip(
+        sample.names, sample.positions, strict=False)).get(settings.joint_theta)) is not None]
+    return [stamp for stamp, _ in told], [theta for _, theta in told]
+
+
+def _turned(sample: EncoderSample, settings: CollectorSettings, *, factor: float = 1.0,
+            zero_rad: float = 0.0) -> EncoderSample:
+    """Return a sample with another theta."""
+    return replace(sample, positions=tuple(
+        factor * position - zero_rad if name == settings.joint_theta else position
+        for name, position in zip(sample.names, sample.positions, strict=False)))
 
 
 def _moved(sample: EncoderSample, settings: CollectorSettings, *, scale: float, swapped: bool,

@@ -92,6 +92,10 @@ class FaultyCell(StageSimulator):
             event = replace(event, offset_x=seen.real, offset_y=seen.imag)
         if self.fault == "wrong ids" and is_detection and event.kind == 0:
             event = replace(event, m=event.n, n=event.m)
+        if self.fault == "m reversed" and is_detection and event.kind == 0:
+            event = replace(event, m=-1 - event.m)  # an even side has m from -N/2 to N/2 - 1
+        if self.fault == "k shifted" and is_detection and event.kind == 1:
+            event = replace(event, k=(event.k + 1) % 8)
         if self.fault == "reversed offset_theta" and is_detection and event.kind == 1:
             event = replace(event, offset_theta=-event.offset_theta)
         super().tell(replace(event, stamp_ns=event.stamp_ns + shift))
@@ -212,6 +216,20 @@ def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
     assert figure in items[name].figure
     assert items[name].remedy
     assert node.exit_code == ExitCode.NOT_QUALIFIED
+
+
+@pytest.mark.usefixtures("short")
+def test_reversed_ids_of_an_even_side_are_named(graph):
+    _, items = checked(graph, "m reversed", plan=plan_of("0, 90, tx", 6, size_y=5, count=8))
+    assert items["ids"].figure.startswith("m is counted against plate x (")
+
+
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize(("sense", "deg"), [("microscope_moves", "-45"), ("plate_moves", "+45")])
+def test_lines_that_are_counted_from_another_one_are_named(graph, sense, deg):
+    _, items = checked(graph, "k shifted", measurement_sense=sense,
+                       checker={"measurement_sense": sense})
+    assert items["ids"].figure.startswith(f"theta is indicated {deg}° from where the lines are (")
 
 
 @pytest.mark.usefixtures("short")

@@ -54,6 +54,8 @@ class Cell(Bench):
         elif view.phase == MEASURE:
             if self.fault == "another view":
                 view.rotation += np.pi / 2
+            if self.fault.endswith("no check stops"):
+                view.check_marks = 0
             self.view, self.planned = view, self.exposures(view)
             self.take_next()
             self.begun_s = self.hands.seconds
@@ -93,8 +95,16 @@ class Cell(Bench):
             x, y = y, x
         if self.fault == "millimetres":
             x, y = 1e3 * x, 1e3 * y
-        if self.fault == "reversed x":
+        if self.fault.startswith("reversed x"):
             x = -x
+        if self.fault == "reversed theta":
+            theta = -theta
+        if self.fault == "theta in degrees":
+            theta = np.rad2deg(theta)
+        if self.fault == "frozen theta":
+            theta = 0.0
+        if self.fault == "another zero of theta":
+            theta += 0.4
         names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
         return SimpleNamespace(header=self.header(now), name=names, position=[x, y, theta])
 
@@ -124,8 +134,11 @@ class Cell(Bench):
                            zip(("offset_x", "offset_y"), noise, strict=True)}
         if self.fault == "backlash":
             seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
-        if self.fault == "m and n exchanged":
-            seen = seen | {"m": seen["n"], "n": seen["m"]}
+        seen = seen | {"m and n exchanged": {"m": seen["n"], "n": seen["m"]},
+                       "m reversed": {"m": -seen["m"]}, "n reversed": {"n": -seen["n"]},
+                       "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
+                       "k reversed": {"k": -seen["k"] % 8},
+                       "k shifted": {"k": (seen["k"] + 1) % 8}}.get(self.fault, {})
         seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
         arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
         self.late.append((arrives, SimpleNamespace(header=self.header(seconds), **seen)))
@@ -165,6 +178,7 @@ def test_the_right_cell_passes(cell):
     assert [item for item in checked(**cell) if not item.passed] == []
 
 
+REVERSED_THETA = "the lines are counted clockwise, or theta is indicated with the wrong sign (54"
 WRONG = [
     ("theta reversed", "theta", "offset_theta has the other sign"),
     ("theta reversed, straight", "theta", "too little to tell the sign"),
@@ -182,6 +196,16 @@ WRONG = [
     ("millimetres", "ids", "the indicated positions are 1000 times those of the marks"),
     ("offsets in mm", "ids", "the offsets are in mm"),
     ("reversed x", "ids", "x is indicated with the wrong sign"),
+    ("m reversed", "ids", "m is counted against plate x (54"),
+    ("reversed x, no check stops", "ids", "m is counted against plate x, or x is indicated with "
+     "the wrong sign (34"),
+    ("n reversed", "ids", "n is counted against plate y (54"),
+    ("m and n reversed", "ids", "m and n are counted against plate x and y (54"),
+    ("reversed theta", "ids", REVERSED_THETA), ("k reversed", "ids", REVERSED_THETA),
+    ("theta in degrees", "ids", "theta is indicated in degrees (54"),
+    ("frozen theta", "ids", "theta does not move: it is indicated at 0 rad during the whole view"),
+    ("another zero of theta", "ids", "theta is indicated +22.92° from where the lines are (54"),
+    ("k shifted", "ids", "theta is indicated -45° from where the lines are (54"),
     ("other joints", "joints", "heard a, b, c"),
     ("old stamps", "detection clock", "stamps 3.008e+04 ms old when they arrive"),
     ("arrives late", "detection clock", "stamps 1.108e+04 ms old when they arrive"),
@@ -199,6 +223,11 @@ REMEDIES = {"theta reversed, straight": "turn the plate by 1 mrad and check agai
             "offsets 1000 times too small": "measure the offset anew in each image",
             "backlash": "repeats of a mark contradict each other; check the stage for backlash",
             "old stamps": "stamp detections at the instant of exposure",
+            "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
+            "theta in degrees": "publish theta in rad",
+            "frozen theta": "turn the stage to each line",
+            "k shifted": "count k from the line along plate x, and set theta to 0",
+            "m reversed": "m counts the marks along plate x",
             "x and y exchanged": "exchange joint_x and joint_y", "reversed x": "reverse the sign"}
 
 
