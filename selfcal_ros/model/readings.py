@@ -15,6 +15,8 @@ from selfcal_ros.model.view import View
 
 OUTLIER = "outlier_among_views"
 REPEAT_OUTLIER = "outlier_among_repeats"
+AFTER_SLIP = " after slip"
+"""End of the name of the part of a view that was read after the plate slipped."""
 Key = tuple[int, str, tuple[int, ...]]
 """A reading: position of its view, ``grid`` or ``angular``, and (m, n) or (k,)."""
 COLUMNS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),

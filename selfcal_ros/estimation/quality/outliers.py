@@ -61,6 +61,7 @@ from selfcal_ros.estimation.verdict.leverage import (
 )
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import (
+    AFTER_SLIP,
     Key,
     Measurements,
     ViewReadings,
@@ -322,7 +323,7 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
-    parts = [_part(view, ~after, ""), _part(view, after, " after slip")]
+    parts = [_part(view, ~after, ""), _part(view, after, AFTER_SLIP)]
     if len(view.k):
         parts.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
     views = (*measurements.views[:slip.index], *parts, *measurements.views[slip.index + 1:])
