@@ -32,6 +32,7 @@ from selfcal_ros.estimation.joint.model_fit import ModelFit, is_untested, square
 from selfcal_ros.estimation.joint.problem import NEGLIGIBLE, SAME, NoiseEstimate, fit
 from selfcal_ros.estimation.joint.solve import Solved, fit_joint, solve_joint
 from selfcal_ros.estimation.multifrontal.factor import one_thread
+from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
@@ -53,7 +54,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.estimation.verdict.untold import untold_effects
 from selfcal_ros.model.error_map import ThetaDatum
-from selfcal_ros.model.readings import REPEAT_OUTLIER, Measurements
+from selfcal_ros.model.readings import AFTER_SLIP, REPEAT_OUTLIER, Measurements, ViewReadings
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
@@ -347,10 +348,7 @@ def _visits_findings(solved: Solved) -> list[Finding]:
 
 
 def _views_findings(measurements: Measurements) -> Iterator[Finding]:
-    """Yield the views in which repeats of marks often contradict each other, then those left out.
-
-    Of the detections of these none became a reading.
-    """
+    """Yield the views whose repeats often contradict each other, then those left out."""
     used: Counter[str] = Counter()
     rejected: dict[str, Counter[str]] = {}
     for view in measurements.views:
@@ -361,10 +359,34 @@ def _views_findings(measurements: Measurements) -> Iterator[Finding]:
         lost, total = counts[REPEAT_OUTLIER], counts[REPEAT_OUTLIER] + used[name]
         if lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
             yield Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
-    for name, counts in rejected.items():
-        if counts and not used[name]:
+    yield from _left_out_findings(measurements)
+
+
+def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
+    """Yield the views of which less than half of the marks, or of the lines, became readings.
+
+    A kind of mark that no view has is not missed in a view that has the other. The parts of a view
+    in which the plate slipped are one view.
+    """
+    artifact, parts = measurements.artifact, dict[str, list[ViewReadings]]()
+    for part in measurements.views:
+        whole = replace(part.view, name=part.view.name.split(AFTER_SLIP)[0])
+        parts.setdefault(whole.plan_view, []).append(part)
+    known = (any(len(part.m) for part in measurements.views),
+             any(len(part.k) for part in measurements.views))
+    for name, of in parts.items():
+        views = {part.view.cell: part.view for part in of}.values()
+        asked = (sum(int(view.on_stage(artifact).mark_rows(artifact)[1].sum())
+                     for view in views if view.grid),
+                 artifact.angular_count * any(view.angular for view in views))
+        read = (sum(len(part.m) for part in of), sum(len(part.k) for part in of))
+        few = any(seen and got < DETERMINED * wanted
+                  for seen, got, wanted in zip(known, read, asked, strict=True))
+        if few or not any(read):
+            rejected = sum((Counter(part.rejected) for part in of), Counter[str]())
             yield Finding("view_left_out", view=name, details={
-                "rejected": {str(reason): count for reason, count in counts.most_common(3)}})
+                "read": list(read), "asked": list(asked),
+                "rejected": {str(reason): count for reason, count in rejected.most_common(3)}})
 
 
 FIRST_DATE_NS = 365 * 86_400 * NS_PER_S

@@ -125,7 +125,7 @@ def measurement_section(result: CalibrationResult) -> Section:
              f"{nx} × {ny} marks, pitch {pitch:.6g} mm")
     x, y = (2 * half * pitch for half in artifact.reach)
     seen = result.observability
-    done = {without_cell(view.name) for view in result.views if measured(view)}
+    done = {without_cell(view.name) for view in result.views if _in_the_map(result)(view)}
     views = f"{counted_views(result.views)}, {len(done)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
              ("plate", f"{marks}, field {x:.6g} × {y:.6g} mm, "
@@ -154,6 +154,12 @@ def measurement_section(result: CalibrationResult) -> Section:
 def measured(view: ViewResult) -> bool:
     """Return whether anything was measured in a view."""
     return view.used > 0 or math.isfinite(view.phi)
+
+
+def _in_the_map(result: CalibrationResult) -> Callable[[ViewResult], bool]:
+    """Return whether a view was measured, and no finding says that most of it is missing."""
+    missing = {found.view for found in result.findings if found.name == "view_left_out"}
+    return lambda view: measured(view) and without_cell(view.name) not in missing
 
 
 def views_section(result: CalibrationResult) -> Section:
@@ -391,7 +397,7 @@ def state_line(result: CalibrationResult) -> str:
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     share = (f" at {figures.n_known} of {figures.n_sites} sites"
              if figures.n_known < figures.n_sites else "")
-    views = counted_views(result.views, measured) + of_few_read(result.findings)
+    views = counted_views(result.views, _in_the_map(result)) + of_few_read(result.findings)
     text = f"Calibrated{share} from {views}"
     if not figures.n_known:
         return text

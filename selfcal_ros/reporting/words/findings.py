@@ -197,9 +197,7 @@ SENTENCES: dict[str, Words] = {
         f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
         "leave out --misalignment linear (or --method law); solved jointly with finite rotations, "
         f"the default, the readings leave {of['residuals'] * UM_PER_M:.3g} µm"),
-    "view_left_out": lambda f, of: (
-        f"view '{f.view}' is not part of the map: none of its detections became a reading ("
-        + ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items()) + ")"),
+    "view_left_out": phrases.view_left_out_text,
     "noise_contradicted": lambda f, of: _noise_contradicted(f, of),
     "noise_unknown": lambda f, of: (
         "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is "

@@ -39,12 +39,14 @@ def dof_text(dof: float) -> str:
 def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
     """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are not views.
 
-    Of the views in which a cell is one `of` those meant.
+    ``3 of 4 views`` if not in all of them a cell is one `of` those meant.
     """
-    number = len({without_cell(view.name) for view in views if of(view)})
+    number = len({without_cell(view.name) for view in views})
+    meant = len({without_cell(view.name) for view in views if of(view)})
     cells = len({view.name.removeprefix(without_cell(view.name)) for view in views} - {""})
     images = f" with images of {cells} marks" if cells else ""
-    return f"{number} view{'s' * (number != 1)}{images}"
+    share = f"{meant} of " * (meant != number)
+    return f"{share}{number} view{'s' * (number != 1)}{images}"
 
 
 def few_read_text(found: Finding, of: dict[str, Any]) -> str:
@@ -57,6 +59,21 @@ def few_read_text(found: Finding, of: dict[str, Any]) -> str:
         f"the camera's error is not known in {_named(of['unknown'])}")
     return (f"few marks were read {where}: look for dirt or a shadow in that part of the image"
             + (f"; {unknown}" if of["unknown"] != [] else ""))
+
+
+def view_left_out_text(found: Finding, of: dict[str, Any]) -> str:
+    """Return the sentence on a view of which nothing, or a small part, became readings."""
+    rejected = ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items())
+    read = of.get("read", [0, 0])  # older results name only views without readings
+    if any(read):
+        parts = " and ".join(
+            f"{got} of {wanted} {kind}" for got, wanted, kind in zip(
+                read, of["asked"], ("marks", "lines"), strict=True) if wanted)
+        text = f"view '{found.view}' is only partly in the map: {parts} became readings"
+    else:
+        text = f"view '{found.view}' is not part of the map: " + (
+            "none of its detections became a reading" if rejected else "nothing was detected in it")
+    return f"{text} ({rejected})" if rejected else text
 
 
 def repeats_contradict_text(found: Finding, of: dict[str, Any]) -> str:
