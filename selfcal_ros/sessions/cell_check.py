@@ -200,9 +200,16 @@ class CellCheck:
             self._has_unread = True
 
     def tick(self) -> None:
-        """Perform due work."""
-        if not self.done:
+        """Perform due work; an error ends the check, which then has failed."""
+        if self.done:
+            return
+        try:
             self.done = next(self._script, self) is self
+        except Exception as error:
+            self.done = True
+            self._tell("check", False, f"ended by an error: {printable(str(error))}",
+                       "correct what the error names, and check again")
+            raise
 
     def _run_and_diagnosed(self) -> Steps[None]:
         """Check the cell, then tell which nodes are in error at the end."""

@@ -23,7 +23,7 @@ from selfcal_ros.cli import cell
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Phase
-from selfcal_ros.errors import ExitCode
+from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.messages import to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.cell_checker import CellChecker
@@ -215,6 +215,18 @@ def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
     assert next(item.name for item in node.session.items if not item.passed) == name
     assert figure in items[name].figure
     assert items[name].remedy
+    assert node.exit_code == ExitCode.NOT_QUALIFIED
+
+
+@pytest.mark.usefixtures("short")
+def test_a_check_that_an_error_ends_has_failed(graph, monkeypatch):
+    def fails(*_):
+        raise InputError("view 'check'", "does not lie on the lattice", "shift it")
+    monkeypatch.setattr(cell_check, "explaining", fails)
+    node, items = checked(graph, "wrong ids")
+    assert failed(items) == {"check"}
+    assert items["check"].figure == (
+        "ended by an error: view 'check': does not lie on the lattice; shift it")
     assert node.exit_code == ExitCode.NOT_QUALIFIED
 
 
