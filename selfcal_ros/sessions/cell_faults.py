@@ -55,9 +55,9 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
     if standing is not None:
         return standing
     total = sum(isinstance(event, Detection) for event in events)
-    used, _ = _outcome(Fault("", "", command, tuple(events)), settings)
+    used, *_ = _outcome(Fault("", "", command, tuple(events)), settings)
     found: list[Fault] = []
-    best = ((used + total) / 2, -np.inf)
+    best: tuple[float, float, float] = ((used + total) / 2, -np.inf, 0)
     for fault in _faults(command, events, settings):
         try:
             outcome = _outcome(fault, settings)
@@ -71,8 +71,8 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
                    remedy="; or ".join(fault.remedy for fault in found)) if found else None
 
 
-def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int]:
-    """Return the detections that would be used, and minus the faults of the offsets."""
+def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
+    """Return the detections that would be used, minus the faults of the offsets, marks seen."""
     collector = Collector(settings)
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
@@ -87,7 +87,9 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int]:
         if isinstance(event, Detection):
             collector.add_detection(event)
     measurements, _ = collector.collect()
-    return (sum(view.used for view in measurements.views), -len(list(wiring_faults(measurements))))
+    views = measurements.views
+    return (sum(view.used for view in views), -len(wiring_faults(measurements)),
+            sum(len(view.m) + len(view.k) for view in views))
 
 
 def _standing(command: Command, events: Sequence[Event], settings: CollectorSettings

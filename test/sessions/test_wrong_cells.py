@@ -241,6 +241,13 @@ def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, f
     assert {(item.follows, item.remedy) for item in others} <= {(name, "")}
 
 
+def test_a_unit_that_would_make_all_marks_one_is_not_named():
+    """Without ids, positions a million times too large would all be those of one mark."""
+    first = next(item for item in checked("millimetres", ids=False) if not item.passed)
+    assert first.figure.startswith("the indicated positions are 1000 times those of the marks: "
+                                   "they are in mm (")
+
+
 def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
     hands = Hands()
     bench = Cell("stands still", hands)
