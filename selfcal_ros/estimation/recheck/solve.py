@@ -64,7 +64,7 @@ from selfcal_ros.estimation.terms.columns import (
     TermColumns,
 )
 from selfcal_ros.estimation.terms.visits import ground_of, without_noise
-from selfcal_ros.estimation.verdict.judge import provenance_of
+from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, first_order, rms
@@ -212,7 +212,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         measurements.plan_id, solved.error_map(), plate.result.artifact_map,
         views_of(measurements, problem, solution.parameters),
         Observability(unknowns, unknowns, 0, True), noise, measurements.all_rejected(),
-        findings=() if failed else changes,
+        findings=(*(() if failed else changes), *views_findings(measurements)),
         sense=str(measurements.sense), kept=kept_covariances(covers),
         run_id=measurements.run_id,
         verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,

@@ -121,7 +121,7 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     result = replace(
         result, verdict=verdict,
         findings=(*result.findings,
-                  *_visits_findings(checked), *_views_findings(measurements),
+                  *_visits_findings(checked), *views_findings(measurements),
                   *[Finding("roughness_untested")] * untested),
         provenance=provenance_of(measurements, options))
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
@@ -347,7 +347,7 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
 
 
-def _views_findings(measurements: Measurements) -> Iterator[Finding]:
+def views_findings(measurements: Measurements) -> Iterator[Finding]:
     """Yield the views whose repeats often contradict each other, then those left out."""
     used: Counter[str] = Counter()
     rejected: dict[str, Counter[str]] = {}

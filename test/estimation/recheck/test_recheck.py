@@ -239,6 +239,16 @@ def test_marks_and_lines_that_are_missing_are_unknown():
 
 
 @pytest.mark.filterwarnings("error")
+def test_a_view_that_is_only_partly_read_is_said():
+    plate, after = known_plate(calibrated(), "r.json"), sessions()[1]
+    view = after.views[0]
+    few = subset(view, np.arange(len(view.m)) < 12, np.ones(len(view.k), dtype=bool))
+    for part, warned in ((view, False), (few, True)):
+        found = worded(recheck(replace(after, views=(part,)), linear(), plate))
+        said = "is only partly in the map: 12 of 25 marks and 8 of 8 lines became readings"
+        assert any(said in text for text in result_to_dict(found)["warnings"]) is warned
+
+
 def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
     """The calibration has not read it: map and u are those of a view without it."""
     before, again = sessions()[0], replace(one_view(Artifact(5, PITCH, 8)).views[0], repeats=2)
