@@ -29,7 +29,7 @@ def cell(graph, ros_environment, tmp_path, forks):
 
 
 def undisturbed(events):
-    return calibrate(collected(events)[1], Options(causes=False)).error_map
+    return calibrate(collected(events)[1], Options()).error_map
 
 
 def same(found, expected):
@@ -76,7 +76,7 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
     [lost] = offline.lost
     assert re.match(r"journal_\w+_2\.mcap: the file ends without its footer,", lost)
     same(read_json(cell.folder / "map.json")["error_map"],
-         calibrate(offline.measurements, Options(causes=False)).error_map)
+         calibrate(offline.measurements, Options()).error_map)
 
 
 def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
