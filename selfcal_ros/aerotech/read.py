@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from itertools import combinations
 
 import numpy as np
 
@@ -337,11 +337,11 @@ def load_cals(paths: Sequence[str]) -> model.CalFile:
         As `load_cal`; or if two files are one, or alike.
     """
     files = [load_cal(path) for path in paths]
-    texts = [Path(path).read_bytes() for path in paths]
-    for at, (path, text) in enumerate(zip(paths, texts, strict=True)):
-        if text in texts[:at]:
-            raise InputError(path, f"is the same as {paths[texts.index(text)]}, and would be added "
-                             "twice", "name it once")
+    for (first, cal), (again, other) in combinations(zip(paths, files, strict=True), 2):
+        if len(cal.tables) == len(other.tables) and all(
+                map(model.same_table, cal.tables, other.tables)):
+            raise InputError(again, f"is the same as {first}, and would be added twice",
+                             "name it once")
     return model.CalFile(", ".join(paths), *(
         tuple(item for cal in files for item in getattr(cal, name))
         for name in ("tables", "findings", "comments")))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -229,11 +230,25 @@ def test_files_that_are_loaded_together_are_added(run, tmp_path):
             f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n")
     code, out, _ = run("eval", "0.cal", "1.cal", "--position", "1=15")
     assert code == 0 and json.loads(out) == {"1": (2 + 5) / 2 + (-1 + 1) / 2}
-    (tmp_path / "copy.cal").write_bytes((tmp_path / "0.cal").read_bytes())
+    (tmp_path / "copy.cal").write_text("; of another day\n" + (tmp_path / "0.cal").read_text())
     for again in ("0.cal", "./0.cal", "copy.cal"):
         code, out, err = run("eval", "0.cal", "1.cal", again, "--position", "1=15")
         assert (code, out) == (2, "")
         one_line(err, f"{again}: is the same as 0.cal, and would be added twice")
+
+
+def test_each_of_several_pipes_is_read_once(run, tmp_path):
+    pipes = []
+    for values in ("0 2 5", "0 -1 1"):
+        end, start = os.pipe()
+        os.write(start, f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n"
+                 ":END\n".encode())
+        os.close(start)
+        pipes.append(f"/dev/fd/{end}")
+    code, out, _ = run("eval", *pipes, "--position", "1=15")
+    assert code == 0 and json.loads(out) == {"1": 3.5}
+    for path in pipes:
+        os.close(int(path.removeprefix("/dev/fd/")))
 
 
 def test_verify_loads_all_files(run):
