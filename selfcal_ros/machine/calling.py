@@ -11,8 +11,9 @@ from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.portable import Ended
 
-LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
-"""Folders of code in which nobody looks for a mistake of their own."""
+STDLIB = sysconfig.get_path("stdlib")
+LIBRARIES = {"site-packages", "dist-packages"}
+"""Names of folders of code in which nobody looks for a mistake of their own."""
 
 
 def called(where: str, function: Callable[..., Any], *values: Any,
@@ -41,7 +42,8 @@ def called(where: str, function: Callable[..., Any], *values: Any,
     except (Exception, SystemExit) as error:
         frames = [frame for frame in traceback.extract_tb(error.__traceback__)
                   if frame.filename != __file__]  # none if a library in C raised it
-        of_user = [frame for frame in frames if not frame.filename.startswith(LIBRARIES)]
+        of_user = [frame for frame in frames if not frame.filename.startswith(STDLIB)
+                   and LIBRARIES.isdisjoint(Path(frame.filename).parts)]
         place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})"
                         for frame in (of_user or frames)[-1:])
         raise MachineError(f"{type(error).__name__}: {first_line(error)}{place}", where,

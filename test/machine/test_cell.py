@@ -76,15 +76,21 @@ def test_a_class_beside_the_file_gets_the_keys_under_its_name(tmp_path):
     ("machine: code:Stage\n", "code.py) has no 'Stage'"),  # of Python, not beside the file
     ("machine: own_stage:Far\n", "JSONDecodeError: Expecting value: line 1 column 1 (char 0) "
      "(own_stage.py, line "),
+    ("machine: own_stage:Deaf\n", "RuntimeError: no answer (own_stage.py, line "),
     ("machine: own_stage:Half\n", "own_stage:Half has no 'move_to'"),
     ("machine: own_stage:Odd\n", "the axes of own_stage:Odd are ('y', 'x')"),
     ("machine: broken_stage:Mine\n", "ZeroDivisionError"),
     ("machine: lacking_stage:Mine\n", "needs the module not_installed_anywhere")])
-def test_a_machine_that_cannot_be_had(tmp_path, text, said):
+def test_a_machine_that_cannot_be_had(tmp_path, monkeypatch, text, said):
     (tmp_path / "own_stage.py").write_text(
         OWN + "\nclass Half:\n    axes = ('x', 'y')\n    position = 1\n"
         "\nclass Far(Mine):\n    def __init__(self): import json; json.loads('')\n"
+        "\nclass Deaf(Mine):\n    def __init__(self): import driver_of_apt; driver_of_apt.ask()\n"
         "\nclass Odd(Mine):\n    axes = ('y', 'x')\n    def __init__(self): pass\n")
+    (tmp_path / "dist-packages").mkdir()
+    monkeypatch.syspath_prepend(tmp_path / "dist-packages")
+    (tmp_path / "dist-packages/driver_of_apt.py").write_text(
+        "def ask():\n    raise RuntimeError('no answer')\n")
     (tmp_path / "broken_stage.py").write_text("1 / 0\n")
     (tmp_path / "lacking_stage.py").write_text("import not_installed_anywhere\n")
     (tmp_path / "cell.yaml").write_text(text + LIMITS)
