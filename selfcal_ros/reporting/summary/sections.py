@@ -125,7 +125,7 @@ def measurement_section(result: CalibrationResult) -> Section:
              f"{nx} × {ny} marks, pitch {pitch:.6g} mm")
     x, y = (2 * half * pitch for half in artifact.reach)
     seen = result.observability
-    done = {without_cell(view.name) for view in result.views if _in_the_map(result)(view)}
+    done = {without_cell(view.name) for view in filter(_in_the_map(result), result.views)}
     views = f"{counted_views(result.views)}, {len(done)} measured"
     facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
              ("plate", f"{marks}, field {x:.6g} × {y:.6g} mm, "
