@@ -4,7 +4,7 @@
 Each possible fault is undone in the recorded messages, which are collected again.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from math import degrees, pi, radians
@@ -132,7 +132,7 @@ def _faults(command: Command, events: Sequence[Event], settings: CollectorSettin
     def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
         return Fault(what, remedy, command, (*samples, *detections))
 
-    yield from _counts(command, samples, seen, settings)
+    yield from _counts(command, samples, seen, settings, fault)
     yield fault("m and n are exchanged", "m counts the marks along plate x, n along plate y",
                 [replace(one, m=one.n, n=one.m) for one in seen])
     for scale, unit in ((1e3, "mm"), (1e6, "µm")):
@@ -165,15 +165,12 @@ def _faults(command: Command, events: Sequence[Event], settings: CollectorSettin
 
 
 def _counts(command: Command, samples: Sequence[EncoderSample], seen: Sequence[Detection],
-            settings: CollectorSettings) -> Iterator[Fault]:
-    """Yield that marks or lines are counted otherwise."""
+            settings: CollectorSettings,
+            fault: Callable[[str, str, Sequence[Detection]], Fault]) -> Iterator[Fault]:
+    """Yield that marks or lines are counted otherwise; `fault` makes one of other detections."""
     view, plate = command.view, command.artifact
     if view is None or plate is None:
         return
-
-    def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
-        return Fault(what, remedy, command, (*samples, *detections))
-
     for signs, what in (((-1, 1), "m is counted against plate x"),
                         ((1, -1), "n is counted against plate y"),
                         ((-1, -1), "m and n are counted against plate x and y")):
