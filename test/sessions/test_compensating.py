@@ -354,6 +354,15 @@ def test_a_file_that_does_not_identify_the_stage_is_refused(tmp_path):
     assert Desk(map=str(path), require_qualified=False).x_at(0.0) is not None
 
 
+def test_a_steep_map_is_used_from_its_file_alone(tmp_path):
+    steep = replace(ONE, gx=ONE.gx + 2e-4 * (np.arange(25) == 24).reshape(5, 5))
+    (tmp_path / "map.json").write_text(json.dumps(result_to_dict(result_of(steep))))
+    used = Desk(map=str(tmp_path / "map.json"), require_qualified=False)
+    assert used.x_at(0.02) is not None
+    with pytest.raises(InputError, match="if it is, load its file with ~/load_map"):
+        Desk(require_qualified=False).session.take_map(map_of(steep))
+
+
 def with_value(field: np.ndarray, value: float) -> np.ndarray:
     """Return a field of a map as in a message, with one value of another kind."""
     return np.append(field.ravel()[:-1], value)
