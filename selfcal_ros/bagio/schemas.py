@@ -274,7 +274,8 @@ class ChannelDecoder:
         self._any_tail = self.told or not self.name.startswith(OWN)
         self._own = same_layout(self.stores[0], self.name) if self.told else False
         self._why = "" if self.told else (
-            f": the bag has no definition of {self.name}, and they do not fit the one known here")
+            f": the bag has no definition of {self.name}, and they do not "
+            "fit the one known here")
         self._columns = ColumnDecoder(self._fields, None if self._any_tail else PADDING) if (
             self._fields is not None and self.role in BLOCKS) else None
 

@@ -191,8 +191,9 @@ class Parser(argparse.ArgumentParser):
         text = super().format_help()
         return f"{text}\nexample:\n  {self.example}\n" if self.example else text
 
-    def parse_args(self, args: Sequence[str] | None = None,  # type: ignore[override]
-                   namespace: argparse.Namespace | None = None) -> argparse.Namespace:
+    def parse_args(  # type: ignore[override]
+            self, args: Sequence[str] | None = None,
+            namespace: argparse.Namespace | None = None) -> argparse.Namespace:
         """Return the arguments; an unknown option ends with a line that names it."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:

@@ -265,7 +265,8 @@ def field_note(predicted: Prediction, plan: Plan) -> str:
     """Return a note if a prediction is not for the plan's own field, else an empty string."""
     nx, ny = predicted.ux.shape
     return "" if (nx, ny) == plan.artifact.field.shape else (
-        f"predicted for a field of {nx} x {ny} sites; XY is about 5 % larger for each doubling of "
+        f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
+        "larger for each doubling of "
         "the field")
 
 

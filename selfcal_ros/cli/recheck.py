@@ -60,9 +60,11 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
                           "rms_gain_change": found.change}}), indent=1))
         return int(ExitCode.DONE)
     tell("\n".join([
-        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of the plate calibrated in "
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of "
+        "the plate calibrated in "
         f"{plan.artifact_from}",
-        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the map remain unknown"]
+        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the "
+           "map remain unknown"]
           if found.map.n_unknown else []),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",

@@ -168,7 +168,8 @@ def _simulate(args: argparse.Namespace) -> int:
     data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)
     text = table_text(data, [
         f"simulated from {args.simulate}; mm; several rows of a block are repeats",
-        "readings are positive on every diagonal (np: rx = -l.dx); a block is a position on the "
+        "readings are positive on every diagonal (np: rx = -l.dx); a "
+        "block is a position on the "
         "axis",
         "ex_x, ey_y: directly measured linear errors, actual - nominal of each step"])
     if args.truth:

@@ -58,7 +58,8 @@ PRINTERS = ("marlin", "klipper")
 """Dialects in mm, with one command in a line, which is always named, and with the axis E."""
 REMEDIES = {
     "G10 G52 G54 G55 G56 G57 G58 G59 G92 G92.1 G92.2 G92.3 M206 M428":
-        "set the frame before the program, and give its zero with --home-x and --home-y",
+        ("set the frame before the program, "
+         "and give its zero with --home-x and --home-y"),
     "G43 G43.1 G49": "write G43 or G49 before the first move in X or Y",
     "G18 G19 R": "have arcs written in the XY plane, with I and J for their centre",
     "G20 G21": "write it once, before the first move",

@@ -101,6 +101,7 @@ def ibaraki_text(found: IbarakiReproduction) -> str:
             f"{found.conventional_um[:, row].mean():8.2f}")
     return "\n".join([
         *lines,
-        "The readings are not published. Ours are of a simulated machine with the measured errors, "
+        "The readings are not published. Ours are of a simulated "
+        "machine with the measured errors, "
         f"10 nm of noise and mirrors {MIRROR_RAD * URAD_PER_RAD:g} urad off,",
         "which explains the published positions of the conventional formulation."])

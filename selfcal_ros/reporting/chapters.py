@@ -272,7 +272,8 @@ def chapters(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None,
         _residuals(result), _rejected(result),
         Chapter("Measurement", _figures(
             (plan_figure(result.plate, views_in(result)) if result.views else None,
-             "The plate as the plan places it; the arrow shows how far its marked corner has "
+             "The plate as the plan places it; the arrow shows how far "
+             "its marked corner has "
              "turned.")), (sections.measurement_section(result), sections.views_section(result))),
         Chapter("Details", sections=tuple(extra_sections(result.extra))),
         Chapter("How to read the numbers", sections=(convention_section(result),

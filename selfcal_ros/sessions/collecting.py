@@ -318,7 +318,8 @@ class CollectingSession:
         self._needed = progress[index].needed if index is not None else 0
         self._since_ns = self.collector.timeline.intervals[-1].start_ns
         self._state = "between views" if index is None else (
-            f"view '{progress[index].view.name}': {100 * progress[index].coverage:.0f} % of the "
+            f"view '{progress[index].view.name}': "
+            f"{100 * progress[index].coverage:.0f} % of the "
             "readings taken")
 
     def diagnosis(self, *, detections_matched: bool) -> Diagnosis:

@@ -74,10 +74,12 @@ def test_kinds_are_seen_in_the_files(desk):
     ("report bags/demo", "bags/demo: is a bag, and a result is needed here; a map is computed "
      "from it with `selfcal solve bags/demo -o RESULT.json`"),
     ("plan check config/simulations/demo.yaml", "config/simulations/demo.yaml: is a simulation, "
-     "and a plan is needed here; `selfcal simulate config/simulations/demo.yaml -o BAG` writes "
+     "and a plan is needed here; `selfcal simulate "
+     "config/simulations/demo.yaml -o BAG` writes "
      "its bag"),
     ("solve bags/demo --params config/plans/hu.yaml", "config/plans/hu.yaml: is a plan, and a "
-     "parameter file of nodes is needed here; `selfcal plan check config/plans/hu.yaml` says "
+     "parameter file of nodes is needed here; `selfcal plan check "
+     "config/plans/hu.yaml` says "
      "what it determines")])
 def test_a_file_in_the_place_of_another_is_named(desk, capsys, words, said):
     assert main(words.split()) == 2

@@ -343,5 +343,6 @@ def test_a_picture_of_no_kind(tmp_path, capsys):
     write_json(tmp_path / "r.json", result_to_dict(known_result(5, 8)[0]))
     assert main(["plot", str(tmp_path / "r.json"), "-o", str(tmp_path / "a.gif")]) == 2
     assert capsys.readouterr() == ("", (
-        f"selfcal plot: {tmp_path / 'a.gif'}: not a picture format by its suffix; name a file that "
+        f"selfcal plot: {tmp_path / 'a.gif'}: not a picture format by "
+        "its suffix; name a file that "
         "ends in .png, .svg or .pdf\n"))

@@ -41,7 +41,8 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
     (told("MEASURING"), "Nothing: the view is being measured."),
     (told("MEASURING", "view 'rot90' stalls", 1), "Look: view 'rot90' stalls."),
     (told("PLACING", "no sign of life from solver", 1),
-     f"Place the plate for view 'rot90' turned by {TURN}, at x 10 mm, y -20 mm; then press c. "
+     f"Place the plate for view 'rot90' turned by {TURN}, at x 10 "
+     "mm, y -20 mm; then press c. "
      "Look: no sign of life from solver."),
     (told("DONE"), "Done. s starts another run."),
     (told("ABORTED"), "Aborted. s starts a new run."),

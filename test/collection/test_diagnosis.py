@@ -85,9 +85,12 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
 def test_the_other_sense(sense):
     other = next(s for s in Sense if s is not sense)
     assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {None: (
-        "24 of 25 detections were rejected as stage_not_at_mark: the plate lies turned by 180°, "
-        "not by 0° (or its ids are those of other marks); turn it as planned and measure this view "
-        "again, or correct its pose in the plan; or, if it lies as planned: the stage is indicated "
+        "24 of 25 detections were rejected as stage_not_at_mark: the "
+        "plate lies turned by 180°, "
+        "not by 0° (or its ids are those of other marks); turn it as "
+        "planned and measure this view "
+        "again, or correct its pose in the plan; or, if it lies as "
+        "planned: the stage is indicated "
         "at minus the marks' sites; the "
         f"sense is reversed: measurement_sense {sense} (--sense {sense})")}
 
@@ -237,7 +240,8 @@ def test_stamps_of_another_exposure(exposures, where, sense):
 
 @pytest.mark.parametrize(("positions", "said"), [
     ((), "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample came "
-     "that can be used, {} were rejected as encoder_sample_malformed; give each name of a joint "
+     "that can be used, {} were rejected as "
+     "encoder_sample_malformed; give each name of a joint "
      "state its position"),
     ((np.nan, np.inf, np.nan), "25 of 25 detections were rejected as no_encoder_sample_near: no "
      "encoder sample came that can be used, {} were rejected as encoder_sample_not_finite; "
@@ -261,7 +265,8 @@ def test_a_clock_of_its_own(ahead_s, side):
     shift = round(ahead_s * S)
     cell.samples = [replace(s, stamp_ns=s.stamp_ns - shift) for s in cell.samples]
     assert findings(cell.events) == {None: (
-        "25 of 25 detections were rejected as no_encoder_sample_near: the detections are stamped "
+        "25 of 25 detections were rejected as "
+        "no_encoder_sample_near: the detections are stamped "
         f"about {abs(ahead_s):g} s {side} the encoder samples; stamp both by one clock")}
 
 

@@ -140,7 +140,8 @@ def test_runs_over_different_places_are_refused():
     (lambda s: replace(s, position_m=s.position_m * 1000), NoDataError,
      "recording: no run along a diagonal; check topics, joints, steps"),
     (lambda s: replace(s, laser_m=s.laser_m * 1000), InputError,
-     "run pp, x move, block 1: 7067.64 where 7.07107 mm is nominal: it looks like micrometres")])
+     "run pp, x move, block 1: 7067.64 where 7.07107 mm is "
+     "nominal: it looks like micrometres")])
 def test_a_spoilt_recording_is_one_clear_line(spoil, kind, message):
     with pytest.raises(kind) as caught:
         cut_zigzag(spoil(recording()), RULE)

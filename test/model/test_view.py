@@ -57,17 +57,20 @@ def test_marks_have_no_sites_between_quarter_turns():
 
 @pytest.mark.parametrize(("view", "plate", "message"), [
     (View("v", 0.0, (0.005, 0.0)), PLATE,
-     "view 'v' translation: 0.5 is not a whole number of pitch steps; place the plate on the"),
+     "view 'v' translation: 0.5 is not a whole number of pitch "
+     "steps; place the plate on the"),
     (View("v", 0.0, (math.nan, 0.0)), PLATE, "view 'v' translation: (nan, 0.0) are not two length"),
     (View("v", 0.0, (0.0, math.inf)), PLATE, "view 'v' translation: (0.0, inf) are not two length"),
     (View("v", math.nan), PLATE, "view 'v' rotation: nan is not an angle; give a finite turn"),
     (View("v", -math.inf), PLATE, "view 'v' rotation: -inf is not an angle; give a finite turn"),
     (View("v", math.radians(15)), PLATE,
-     "view 'v': grid marks cannot be measured at a turn of 15 deg; turn by 90 deg, set grid to"),
+     "view 'v': grid marks cannot be measured at a turn of 15 "
+     "deg; turn by 90 deg, set grid to"),
     (View("v", math.radians(7), grid=False), PLATE,
      "view 'v' rotation: 0.466667 is not a whole number of angular line steps"),
     (View("v", math.radians(15), grid=False), Artifact(11, 0.01),
-     "view 'v': a turn that is not a quarter needs angular lines; turn by a multiple of 90 deg")])
+     "view 'v': a turn that is not a quarter needs angular lines; "
+     "turn by a multiple of 90 deg")])
 def test_poses_off_the_lattice_are_refused(view, plate, message):
     with pytest.raises(InputError) as caught:
         view.lattice_pose(plate)
@@ -145,7 +148,8 @@ def test_a_plate_without_angular_count_has_no_lines():
     (plan_with(artifact={"grid_size": 11, "angular_count": 0}),
      "f: artifact: the key 'grid_pitch' is missing"),
     (plan_with({"rotation": 90}),
-     "f: views[0]: rotation: unknown key; did you mean 'rotation_deg'? known are name, rotation_"),
+     "f: views[0]: rotation: unknown key; did you mean "
+     "'rotation_deg'? known are name, rotation_"),
     (plan_with({"rotation_deg": "90"}), "f: views[0]: rotation_deg: '90' is not of type float"),
     (plan_with({"rotation_deg": math.nan}), "view 'a' rotation: nan is not an angle"),
     (plan_with({"rotation_deg": math.inf}), "view 'a' rotation: inf is not an angle"),
@@ -155,7 +159,8 @@ def test_a_plate_without_angular_count_has_no_lines():
     (plan_with({"translation_pitch": [1]}), "f: views[0]: translation_pitch: not two numbers; "),
     (plan_with({"translation_pitch": ["1", 0]}), "f: views[0]: translation_pitch: not two number"),
     (plan_with({"translation_pitch": [0.5, 0], "grid": False}),
-     "view 'a' translation: 0.5 is not a whole number of pitch steps; place the plate on the latt"),
+     "view 'a' translation: 0.5 is not a whole number of pitch "
+     "steps; place the plate on the latt"),
     (plan_with({"translation_pitch": [2e5, 0]}), "view 'a' translation: 200000 pitches are beyond"),
     (plan_with({"translation_mm": [-2e9, 0.5]}), "view 'a' translation: -2e+08 pitches are beyond"),
     (plan_with({"translation_mm": [1, math.nan]}), "view 'a' translation: (0.001, nan) are not tw"),
@@ -176,7 +181,8 @@ def test_a_plate_without_angular_count_has_no_lines():
     (plan_with({"grid": 1}), "f: views[0]: grid: 1 is not of type bool"),
     (plan_with({"grid": False, "angular": False}), "f: views[0]: neither grid nor angular marks"),
     ({**plan_with({"angular": True}), "artifact": {**PLAN["artifact"], "angular_count": 0}},
-     "f: views[0]: angular marks are wanted but the plate has none; set angular to false, or "
+     "f: views[0]: angular marks are wanted but the plate has "
+     "none; set angular to false, or "
      "give the plate its angular_count")])
 def test_plans_that_are_refused(data, message):
     with pytest.raises(InputError) as caught:

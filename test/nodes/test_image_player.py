@@ -179,7 +179,8 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
 
 
 @pytest.mark.parametrize(("options", "problem"), [
-    ([], "has images and no detections: options: pixel_size and mark_size: are not set; give them "
+    ([], "has images and no detections: options: pixel_size and "
+         "mark_size: are not set; give them "
      "in m; `selfcal camera init` finds the size of a pixel"),
     (["--pixel-size", "6e-6"], "has images and no detections: options: mark_size: is not set; give "
      "it in m"),

@@ -175,7 +175,8 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
     assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
     assert lines == [(Level.ERROR, (
         "bag_player: /measurement_collector does not listen to stage/joint_states, "
-        "stage/mark_detections, selfcal/view_command after 0.2 s, nothing was played; start it, "
+        "stage/mark_detections, selfcal/view_command after 0.2 s, "
+        "nothing was played; start it, "
         "name another node as listener, or set listener to '' to play without waiting"))]
 
 

@@ -432,7 +432,8 @@ class Locked:
 
 @pytest.mark.parametrize(("reason", "in_health", "refused"), [
     (InputError("journal_1", "another process writes this journal", "end it"),
-     "journal_1: another process writes this journal; end it; 90 messages are not in the journal",
+     "journal_1: another process writes this journal; end it; 90 "
+     "messages are not in the journal",
      {}),
     (ZeroDivisionError("within"), "no room; 90 messages are not in the journal",
      {"journal: within": 1})])

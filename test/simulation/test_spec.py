@@ -155,14 +155,16 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ("[1]", ": not a mapping; see docs/guides/simulate.md"),
     ({}, ": the key 'plan' is missing; name a PLAN.yaml"),
     ({"plan": PLAN, "sed": 1}, ": sed: unknown key; did you mean 'seed'? known are plan, truth, "
-     "physics, placed, noise, cell, faults, camera, correction, seed, noise_seed, start_time, "
+     "physics, placed, noise, cell, faults, camera, correction, "
+     "seed, noise_seed, start_time, "
      "compression"),
     ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
     ({"plan": True}, ": plan: not a mapping of keys to values; see the examples in config"),
     ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/guides/simulate.md"),
     ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/guides/simulate.md"),
     ({"plan": PLAN, "noise": {"encoder_rate": 500}}, ": noise: encoder_rate: unknown key; known "
-     "are sigma_xy, sigma_theta, noise_ratio, visit_xy, image_xy, flicker_xy, flicker_theta, "
+     "are sigma_xy, sigma_theta, noise_ratio, visit_xy, image_xy, "
+     "flicker_xy, flicker_theta, "
      "resolution_xy, resolution_theta"),
     ({"plan": PLAN, "placed": [{"name": "c"}]}, ": placed: the plan has no view 'c'; known are a, "
      "b"),
@@ -177,7 +179,8 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
     ({"plan": PLAN, "cell": {"encoder_rate": 100}}, ": simulated cell: 100 Hz gives fewer than 2.5 "
      "encoder samples in a dwell of 0.006 s; raise encoder_rate or exposure_period"),
     ({"plan": PLAN, "faults": {"lost": 0.6, "duplicated": 0.6}}, ": faults: the parts of the "
-     "detections add up to 1.2; keep the sum at 1 or below: a detection has one fault at most"),
+     "detections add up to 1.2; keep the sum at 1 or below: a "
+     "detection has one fault at most"),
     ({"plan": PLAN, "faults": {"delay": 0.6, "delay_s": 0.6}}, ": faults: delay_s: given twice; "
      "remove one"),
 ])

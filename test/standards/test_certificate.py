@@ -440,9 +440,11 @@ def changed(value, *path):
     (changed("20.11.2026", "certificate", "begin"), "'20.11.2026' is not a date YYYY-MM-DD"),
     (changed("2026-11-19", "certificate", "end"), "2026-11-19 is before 2026-11-21"),
     (changed("2026-11-20", "certificate", "issued"),
-     "certificate.issued: 2026-11-20 is before the end of the measurement, 2026-11-21; correct"),
+     "certificate.issued: 2026-11-20 is before the end of the "
+     "measurement, 2026-11-21; correct"),
     (changed("2026-11-20", "equipment", 0, "valid_until"),
-     r"equipment\[0\].valid_until: 2026-11-20 is before the end of the measurement, 2026-11-21"),
+     r"equipment\[0\].valid_until: 2026-11-20 is before the end of "
+     r"the measurement, 2026-11-21"),
     (changed("soon", "equipment", 1, "valid_until"), r"equipment\[1\].valid_until: 'soon' is not"),
     (changed("here", "certificate", "place"), "place: 'here' is not one of laboratory, customer"),
     (changed("x", "certificate", "idd"), "certificate.idd: is unknown; did you mean 'id'"),
@@ -450,7 +452,8 @@ def changed(value, *path):
     (changed("warm", "conditions", 0, "value"), r"conditions\[0\].value: 'warm' is not a number"),
     (changed("degF", "conditions", 0, "unit"), "'degF' is not one of degC"),
     (changed(293.55, "conditions", 0, "value"),
-     r"conditions\[0\]: 293.55 is not a temperature from -50 to 100 degC: is it in K\?; give degC"),
+     r"conditions\[0\]: 293.55 is not a temperature from -50 to "
+     r"100 degC: is it in K\?; give degC"),
     (without("conditions", 0, "unit"), r"conditions\[0\]: neither a value with its unit nor"),
     (changed(0, "conditions", 0, "u"), r"conditions\[0\]: neither a value"),
     (changed("  ", "item", "name"), "item.name: '  ' is not a text"),

@@ -38,7 +38,8 @@ def left_out(result):
 
 @pytest.mark.parametrize(("marks", "lines", "rejected", "said"), [
     (0, 0, {"too_far_from_nominal": 50, "low_score": 2},
-     "is not part of the map: none of its detections became a reading (too_far_from_nominal 50, "
+     "is not part of the map: none of its detections became a "
+     "reading (too_far_from_nominal 50, "
      "low_score 2)"),
     (0, 0, {}, "is not part of the map: nothing was detected in it"),
     (1, 0, {"stage_not_at_mark": 144}, "is only partly in the map: 1 of {marks} marks and 0 of "

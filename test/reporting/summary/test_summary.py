@@ -360,7 +360,8 @@ def test_truth_with_unknown_sites():
 @pytest.mark.parametrize(("truth", "message"), [
     ({}, "truth gx: missing; give gx, gy (m) and g_theta (rad)"),
     ({"gx": np.zeros((3, 3)), "gy": np.zeros((5, 5))},
-     "truth gx: has the shape (3, 3), the map has (5, 5); give the truth on the lattice of the "
+     "truth gx: has the shape (3, 3), the map has (5, 5); give "
+     "the truth on the lattice of the "
      "map"),
     ({"gx": [[1], [2, 3]], "gy": 0},
      "truth gx: not an array of numbers; give lists of numbers and null"),

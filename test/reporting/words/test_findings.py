@@ -78,7 +78,8 @@ def strained(part, size):
                  [1e-9, 0, 0, 25.6e-9], 1e-9), "a drift of 0.0512 ± 0.0020 µm along y during view "
      "'+x': visit the marks there and back", 51.2e-9, 2e-9, "m"),
     (explanation("plate_scale", [(1, ""), (2, "")], [1e-7, -2e-6], 1e-7),
-     "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in view '0': let the plate reach "
+     "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in "
+     "view '0': let the plate reach "
      "thermal equilibrium", -2e-6, 1e-7, "m/m"),
     (explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7),
      "a plate larger by 2.00 ± 0.10 µm/m in view '+x' than in view '0': let the plate reach "
@@ -92,10 +93,12 @@ def strained(part, size):
         ("shear", 3e-6, "stretched along its diagonal at 45° and compressed along the other"),
         ("shear", -3e-6, "stretched along its diagonal at 135° and compressed along the other"))),
     (explanation("plate_shape", [(1, "x x2"), (1, "y x2")], [3e-8, 0], 1.5e-9),
-     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' relative to view "
+     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
+     "in view '90' relative to view "
      f"'0': {CLAMP}", 3e-8, 1.5e-9, "m"),
     (explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, whole=False),
-     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge in view '90' relative to view "
+     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
+     "in view '90' relative to view "
      f"'0', part of which cannot be separated from the stage: {CLAMP}", -3e-8, 1.5e-9, "m"),
     (explanation("approach", [(-1, "x"), (-1, "y")], [0, 2e-8], 1e-9),
      "an indicated y that changes by ±(0.0200 ± 0.0010 µm) with the direction of approach: "
@@ -103,14 +106,17 @@ def strained(part, size):
     # 3 and 4 make 5
     (explanation("line_eccentricity", [(0, "cos"), (0, "sin"), (1, "cos"), (1, "sin")],
                  [1e-7, 0, 3e-6, -4e-6], 1e-7),
-     "a circle of lines off the axis of rotation by 5.00 ± 0.10 µrad of its radius in view '90': "
+     "a circle of lines off the axis of rotation by 5.00 ± 0.10 "
+     "µrad of its radius in view '90': "
      "centre the circle of lines on the axis of rotation in each view", 5e-6, 1e-7, "rad"),
     # a rotation is in units of what it does at the half width, 0.05 m
     (explanation("slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4),
-     "a plate that slipped by (0.3, -0.4) µm and 1 µrad after about 40% of view '90': measure the "
+     "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
+     "about 40% of view '90': measure the "
      "view again, or solve with --robust", 5e-7, 1e-8, "m"),
     (explanation("reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)),
-     "a reading of mark (-2, 5) in view '+x' that is off by 0.500 ± 0.010 µm: solve with --robust, "
+     "a reading of mark (-2, 5) in view '+x' that is off by 0.500 "
+     "± 0.010 µm: solve with --robust, "
      "or measure it again", 5e-7, 1e-8, "m")])
 def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, GROUND)
@@ -126,15 +132,18 @@ CAUSES = [
        f"offsets of the lines too {how} by 5.00 ± 0.10 %: {COMPARE}")
       for size, how in ((0.05, "small"), (-0.05, "large"))),
     *((replace(SCALE, name="line_scale", size=size),
-       f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a microscope that shows lengths too "
+       f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a "
+       "microscope that shows lengths too "
        f"{other} by as much: {COMPARE}")
       for size, how, other in ((0.06, "small", "long"), (-0.06, "large", "short"))),
     *((replace(SCALE, size=size),
-       f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, or offsets of the lines too "
+       f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, "
+       "or offsets of the lines too "
        f"{other} by as much: {ALIGN}")
       for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))),
     (Cause("reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)),
-     "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 arcsec: solve with --robust, or "
+     "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 "
+     "arcsec: solve with --robust, or "
      "measure it again"),
     *((Cause("rotation", sign * 2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90"),
        f"lines turned {way} by 2.00 ± 0.10 arcsec relative to the marks in view '90': check "
@@ -184,11 +193,13 @@ FINDINGS = [
      "repeats share what single readings do not (drift between passes), or the stated noise is "
      "too large"),
     (Finding("noise_unknown"),
-     "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is not "
+     "grid readings: neither repeats nor residuals determine the "
+     "noise, so the uncertainty is not "
      "known; read every mark twice"),
     (Finding("finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}),
      "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
-     "--misalignment linear (or --method law); solved jointly with finite rotations, the default, "
+     "--misalignment linear (or --method law); solved jointly "
+     "with finite rotations, the default, "
      "the readings leave 0.0204 µm"),
     (Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=0.0012),
      "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure 3 "
@@ -203,22 +214,26 @@ FINDINGS = [
      "1 site (5, -3) of the map rests on a single reading that no other checks; an error in it "
      "goes into the map, and no residual shows it: measure the missing marks, or add a view"),
     (unchecked([[m, 5] for m in range(7)], [4, 11]),
-     "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) and 2 lines (4, 11) of the map "
+     "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) "
+     "and 2 lines (4, 11) of the map "
      "rest on single readings that no other checks; an error in them goes into the map, and no "
      "residual shows it: measure the missing marks, or add a view"),
     (unchecked([], [4]),
      "1 line 4 of the map rests on a single reading that no other checks; an error in it goes "
      "into the map, and no residual shows it: measure the missing marks, or add a view"),
     *((Finding("magnification", sign * 2e-3, 1e-5, "m/m"),
-       f"the plate is {word} than the encoders indicate by 2000 ± 10 µm/m, more than plate and "
-       "encoders should differ: check the pitch in the plan (grid_pitch), and the scale of the "
+       f"the plate is {word} than the encoders indicate by 2000 ± 10 "
+       "µm/m, more than plate and "
+       "encoders should differ: check the pitch in the plan "
+       "(grid_pitch), and the scale of the "
        "encoders") for sign, word in ((1, "larger"), (-1, "smaller"))),
     (Finding("drawn_uncertainty", details={"draws": 200}),
      "uncertainties of Hu's law from 200 draws of unit noise: 5.0 % standard error"),
     (outliers(2, [("90", "grid", [0, -2], 5.04), ("a", "angular", [7], 9.0)]),
      "removed 2 outliers: '90' grid (0, -2) (5.0 sigma), 'a' angular 7 (9.0 sigma)"),
     (outliers(3, [("90", "grid", [0, -2], 5.04), ("90", "grid", [1, -2], 6.04)]),
-     "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' grid (1, -2) (6.0 sigma) and 1 more"),
+     "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' "
+     "grid (1, -2) (6.0 sigma) and 1 more"),
     (outliers(1, [("90", "grid", [0, -2], 5.04)]),
      "removed 1 outlier: '90' grid (0, -2) (5.0 sigma)"),
     (Finding("noisy_view", 2.26, view="90"),
@@ -237,10 +252,12 @@ FINDINGS = [
      "view '90': the plate slipped before m = 2 by (0.3, -0.4) µm and 5 µrad; treated as two "
      "placements; this spoils the map: measure the view again"),
     (slip([("90", "m", 2), ("+x", "n", 0)], spoils=False, y=0.0, phi=0.0),
-     "view '90': the plate slipped by about (0.3, 0) µm and 0 µrad, before m = 2 or before n = 0 "
+     "view '90': the plate slipped by about (0.3, 0) µm and 0 "
+     "µrad, before m = 2 or before n = 0 "
      "in view '+x'; the readings do not determine which; the view is left out"),
     (slip([("90", "m", 2), ("90", "n", 0)], spoils=True),
-     "view '90': the plate slipped by about (0.3, -0.4) µm and 5 µrad, before m = 2 or before n = "
+     "view '90': the plate slipped by about (0.3, -0.4) µm and 5 "
+     "µrad, before m = 2 or before n = "
      "0; the readings do not determine which; this spoils the map: measure the view again"),
     (replace(TURN, name="taken_for_slip", details={
         "part": "turn", "cause": "microscope", "slip_in": "+x"}),
